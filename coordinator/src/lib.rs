@@ -1,0 +1,1 @@
+//! The coordinator: plans a bake, leases its tasks, publishes the dataset.

@@ -1,0 +1,1 @@
+//! Bake configuration, plans, task states and pure scheduling.

@@ -1,0 +1,1 @@
+//! Pixel error of visible sets against the full scene.

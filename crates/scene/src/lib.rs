@@ -1,0 +1,1 @@
+//! glTF scenes: reading, validation, numbering, view regions, generators.

@@ -1,0 +1,1 @@
+//! From-segment visibility: the fast solver and its exact reference twin.

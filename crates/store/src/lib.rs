@@ -1,0 +1,1 @@
+//! The visibility dataset: Parquet layout, manifest, commits, reader.

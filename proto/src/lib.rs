@@ -1,0 +1,1 @@
+//! The cluster protocol: generated gRPC code and conversions.

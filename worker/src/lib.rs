@@ -1,0 +1,1 @@
+//! The worker: leases tasks, solves them, writes the results.
