@@ -88,10 +88,7 @@ impl Bounds32 {
             let f = v as f32;
             if f64::from(f) < v { f.next_up() } else { f }
         };
-        Self {
-            min: bounds.min.to_array().map(down),
-            max: bounds.max.to_array().map(up),
-        }
+        Self { min: bounds.min.to_array().map(down), max: bounds.max.to_array().map(up) }
     }
 
     /// The smallest box around `f32` points (exact).

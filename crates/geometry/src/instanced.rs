@@ -52,9 +52,17 @@ impl Mesh {
     }
 
     /// Mesh-space corners of triangle `t`.
+    #[inline]
     #[must_use]
     pub fn corners(&self, t: usize) -> [DVec3; 3] {
-        self.triangles[t].map(|v| DVec3::from_array(self.positions[v as usize].map(f64::from)))
+        self.stored_corners(t).map(|p| DVec3::from_array(p.map(f64::from)))
+    }
+
+    /// Mesh-space corners of triangle `t` as stored.
+    #[inline(always)]
+    pub(crate) fn stored_corners(&self, t: usize) -> [[f32; 3]; 3] {
+        let [a, b, c] = self.triangles[t];
+        [self.positions[a as usize], self.positions[b as usize], self.positions[c as usize]]
     }
 }
 
@@ -72,6 +80,28 @@ pub struct Instance {
     /// False for see-through instances: they can be visible but hide nothing.
     pub occluder: bool,
 }
+
+/// What rays need of an instance: the way back into mesh space.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Placement {
+    /// Mesh space from world space: the inverse of the instance's transform.
+    pub(crate) mesh_from_world: DAffine3,
+    /// True when the transform turns triangles inside out.
+    pub(crate) mirrored: bool,
+}
+
+impl Placement {
+    fn of(instance: &Instance) -> Self {
+        Self {
+            mesh_from_world: instance.world_from_mesh.inverse(),
+            mirrored: instance.world_from_mesh.matrix3.determinant() < 0.0,
+        }
+    }
+}
+
+/// Most instances whose placements are kept, which bounds the table to 104 MiB; a meadow of
+/// millions of instances inverts a transform where a ray meets its box.
+const PLACEMENTS_MAX: usize = 1 << 20;
 
 /// A hierarchy over instances, its boxes relative to the origin of the geometry.
 #[derive(Clone, Debug, Default)]
@@ -98,6 +128,8 @@ pub struct InstancedGeometry {
     pub see_through: TopLevel,
     /// World box of everything.
     pub bounds: Bounds,
+    /// One placement an instance, or none at all above [`PLACEMENTS_MAX`] instances.
+    placements: Vec<Placement>,
 }
 
 impl InstancedGeometry {
@@ -131,20 +163,28 @@ impl InstancedGeometry {
                 })
                 .collect();
             let (hierarchy, order) = Hierarchy::build(&relative);
-            let instances =
-                order.iter().map(|&o| InstanceId(chosen[o as usize] as u32)).collect();
+            let instances = order.iter().map(|&o| InstanceId(chosen[o as usize] as u32)).collect();
             TopLevel { hierarchy, instances }
         };
         let (occluders, see_through) = (top_level(true), top_level(false));
-        Self { origin, meshes, instances, occluders, see_through, bounds }
+        let kept = if instances.len() <= PLACEMENTS_MAX { instances.as_slice() } else { &[] };
+        let placements = kept.iter().map(Placement::of).collect();
+        Self { origin, meshes, instances, occluders, see_through, bounds, placements }
+    }
+
+    /// The way from world space into the space of an instance's mesh.
+    #[inline]
+    pub(crate) fn placement(&self, instance: InstanceId) -> Placement {
+        let kept = self.placements.get(instance.index());
+        kept.copied().unwrap_or_else(|| Placement::of(&self.instances[instance.index()]))
     }
 
     /// Number of primitives: one more than the largest global number.
     #[must_use]
     pub fn primitive_count(&self) -> u32 {
-        self.instances.last().map_or(0, |i| {
-            i.first_primitive.0 + self.meshes[i.mesh.index()].triangles.len() as u32
-        })
+        self.instances
+            .last()
+            .map_or(0, |i| i.first_primitive.0 + self.meshes[i.mesh.index()].triangles.len() as u32)
     }
 
     /// Number of triangles in memory.

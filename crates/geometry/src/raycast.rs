@@ -13,6 +13,7 @@ use glam::DVec3;
 
 use crate::{
     Hierarchy, InstanceId, InstancedGeometry, Node, PrimitiveId, TopLevel, UNIT_ROUNDOFF,
+    instanced::Placement,
 };
 
 /// A half-line `origin + distance * direction`, world space.
@@ -39,10 +40,12 @@ pub struct Hit {
 
 /// A ray prepared for triangle tests: the dominant axis and the shear of the Woop test.
 struct Sheared {
-    origin: DVec3,
+    origin: [f64; 3],
     axes: [usize; 3],
     shear: DVec3,
-    inverse: DVec3,
+    inverse: [f64; 3],
+    /// True on axes where the direction points down: boxes are entered by their upper side.
+    downward: [bool; 3],
 }
 
 impl Sheared {
@@ -60,17 +63,26 @@ impl Sheared {
             std::mem::swap(&mut kx, &mut ky);
         }
         let shear = DVec3::new(d[kx] / d[kz], d[ky] / d[kz], 1.0 / d[kz]);
-        Self { origin: ray.origin, axes: [kx, ky, kz], shear, inverse: d.recip() }
+        let inverse = d.recip().to_array();
+        let downward = inverse.map(|i| i < 0.0);
+        Self { origin: ray.origin.to_array(), axes: [kx, ky, kz], shear, inverse, downward }
+    }
+
+    /// A corner in the ray's sheared space, relative to its origin.
+    #[inline(always)]
+    fn sheared(&self, corner: [f32; 3]) -> (f64, f64, f64) {
+        let [kx, ky, kz] = self.axes;
+        let z = f64::from(corner[kz]) - self.origin[kz];
+        let x = (f64::from(corner[kx]) - self.origin[kx]) - self.shear.x * z;
+        let y = (f64::from(corner[ky]) - self.origin[ky]) - self.shear.y * z;
+        (x, y, z)
     }
 
     /// Distance to the triangle and the sign of its determinant (> 0: front), if hit.
-    #[inline]
-    fn triangle(&self, corners: [DVec3; 3]) -> Option<(f64, bool)> {
-        let [kx, ky, kz] = self.axes;
-        let p = corners.map(|c| {
-            let q = c - self.origin;
-            (q[kx] - self.shear.x * q[kz], q[ky] - self.shear.y * q[kz], q[kz])
-        });
+    #[inline(always)]
+    fn triangle(&self, corners: [[f32; 3]; 3]) -> Option<(f64, bool)> {
+        let [a, b, c] = corners;
+        let p = [self.sheared(a), self.sheared(b), self.sheared(c)];
         let u = p[2].0 * p[1].1 - p[2].1 * p[1].0;
         let v = p[0].0 * p[2].1 - p[0].1 * p[2].0;
         let w = p[1].0 * p[0].1 - p[1].1 * p[0].0;
@@ -86,18 +98,20 @@ impl Sheared {
     }
 
     /// Entry distance into a node's box, if the box is met within `limit`.
-    #[inline]
+    #[inline(always)]
     fn node(&self, node: &Node, limit: f64) -> Option<f64> {
         // Two roundings of (b - o) * inverse, doubled: the far side is moved out by it, after
         // Ize, "Robust BVH Ray Traversal" (JCGT 2013).
         const SLACK: f64 = 1.0 + 8.0 * UNIT_ROUNDOFF;
         let (mut near, mut far) = (0.0_f64, limit);
+        let (min, max) = (&node.bounds.min, &node.bounds.max);
         for k in 0..3 {
-            let a = (f64::from(node.bounds.min[k]) - self.origin[k]) * self.inverse[k];
-            let b = (f64::from(node.bounds.max[k]) - self.origin[k]) * self.inverse[k];
-            // `max` and `min` drop the NaN of 0 * inf: the ray lies in the slab's border.
-            near = near.max(a.min(b));
-            far = far.min(a.max(b) * SLACK);
+            let (enter, leave) = if self.downward[k] { (max[k], min[k]) } else { (min[k], max[k]) };
+            let enter = (f64::from(enter) - self.origin[k]) * self.inverse[k];
+            let leave = (f64::from(leave) - self.origin[k]) * self.inverse[k] * SLACK;
+            // The NaN of 0 * inf compares false and is dropped: the ray lies in the slab's border.
+            near = if enter > near { enter } else { near };
+            far = if leave < far { leave } else { far };
         }
         (near <= far).then_some(near)
     }
@@ -172,15 +186,14 @@ impl RayCaster {
                 let instance = &geometry.instances[id.index()];
                 let mesh = &geometry.meshes[instance.mesh.index()];
                 // The affine inverse keeps distances: they are in units of the direction.
-                let mesh_from_world = instance.world_from_mesh.inverse();
-                let mirrored = instance.world_from_mesh.matrix3.determinant() < 0.0;
+                let Placement { mesh_from_world, mirrored } = geometry.placement(id);
                 let local = Sheared::new(Ray {
                     origin: mesh_from_world.transform_point3(ray.origin),
                     direction: mesh_from_world.transform_vector3(ray.direction),
                 });
                 limit = walk(&mesh.hierarchy, &local, limit, bottom, |items, mut limit| {
                     for t in items {
-                        let Some((distance, front)) = local.triangle(mesh.corners(t)) else {
+                        let Some((distance, front)) = local.triangle(mesh.stored_corners(t)) else {
                             continue;
                         };
                         let primitive = PrimitiveId(instance.first_primitive.0 + t as u32);
@@ -208,9 +221,8 @@ impl RayCaster {
     ) -> Option<Hit> {
         let mut best: Option<Hit> = None;
         self.visit(geometry, &geometry.occluders, ray, limit, &mut accept, &mut |hit, limit| {
-            let better = best.is_none_or(|b| {
-                (hit.distance, hit.primitive) < (b.distance, b.primitive)
-            });
+            let better =
+                best.is_none_or(|b| (hit.distance, hit.primitive) < (b.distance, b.primitive));
             if better {
                 best = Some(hit);
             }
@@ -227,12 +239,19 @@ impl RayCaster {
         limit: f64,
         mut found: impl FnMut(Hit),
     ) {
-        self.visit(geometry, &geometry.see_through, ray, limit, &mut |_| true, &mut |hit, limit| {
-            if hit.distance < limit {
-                found(hit);
-            }
-            limit
-        });
+        self.visit(
+            geometry,
+            &geometry.see_through,
+            ray,
+            limit,
+            &mut |_| true,
+            &mut |hit, limit| {
+                if hit.distance < limit {
+                    found(hit);
+                }
+                limit
+            },
+        );
     }
 }
 

@@ -1,0 +1,56 @@
+//! The error bounds of the solver, derived once and used by every comparison.
+//!
+//! Let u be the unit roundoff and S a bound on |P - v0| over the scene, so that every face
+//! coordinate x, y, z of a vertex is at most S.
+//!
+//! - *Vertex*: `x = m . p + b` with a composed matrix row m (3 products of 3 terms: 5 roundings
+//!   an entry) and offset b (T - v0 and 3 products: 6), then 3 products and 3 sums: the error is
+//!   at most gamma(12) S.
+//! - *Cut*: h = y - w z adds 2 roundings; lambda = hP / (hP - hQ) is a convex weight; its error
+//!   moves the cut point along the edge, by at most the error of h over the edge's slope against
+//!   the row plane. Along the edge that is a point of the true triangle displaced *within* the
+//!   edge's own line, so the cut stays within gamma(12) S of the true edge, plus gamma(4) S for
+//!   the interpolation: gamma(16) S off the line in all.
+//! - *Depth*: z of a cut at t is interpolated between its ends: gamma(16) S + 4 u S, and the
+//!   error of t times the slope of the cut.
+//! - *Time*: t = (x - c z) / L: (gamma(16) S (1 + |c|) + 3 u S (1 + |c|)) / L.
+//!
+//! Both constants are rounded up to gamma(32), which leaves room for the second-order terms.
+
+use sightline_geometry::{Bounds, RectifiedFrame, gamma};
+
+/// Bounds on the rounding errors of one segment's solve.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ErrorBounds {
+    /// Largest error of a face coordinate or of a depth at exact t, metres.
+    pub depth: f64,
+    /// `time * (1 + |c|)` is the largest error of an interval's end at column c, in units of t.
+    time_per_column: f64,
+}
+
+impl ErrorBounds {
+    /// The bounds for a scene box and a segment's frame.
+    #[must_use]
+    pub fn new(scene: Bounds, frame: &RectifiedFrame) -> Self {
+        let reach = if scene.is_empty() {
+            frame.length
+        } else {
+            let far = (scene.min - frame.v0).abs().max((scene.max - frame.v0).abs());
+            far.length() + frame.length
+        };
+        let depth = gamma(32) * reach;
+        Self { depth, time_per_column: depth / frame.length }
+    }
+
+    /// Largest error of an interval's end at column `c`, in units of t.
+    #[must_use]
+    pub fn time(&self, c: f64) -> f64 {
+        self.time_per_column * (1.0 + c.abs())
+    }
+
+    /// Intervals up to this length (units of t) may be rounding alone: both ends may be off.
+    #[must_use]
+    pub fn shortest_interval(&self, c: f64) -> f64 {
+        2.0 * self.time(c)
+    }
+}
