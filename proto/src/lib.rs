@@ -1,1 +1,22 @@
-//! The cluster protocol: generated gRPC code and conversions.
+//! The cluster protocol: generated gRPC code, and conversions from and to [`sightline_jobs`].
+//!
+//! Promise: what converts without an error is well formed. Messages come from other processes
+//! and stored files, so a missing or impossible field is a [`ConvertError`], never a panic.
+
+mod convert;
+
+pub use convert::{ConvertError, decode_plan, encode_plan};
+
+/// Generated from `sightline/v1/*.proto`.
+#[allow(missing_docs, clippy::pedantic)]
+pub mod v1 {
+    tonic::include_proto!("sightline.v1");
+
+    /// Descriptors of all messages and services, for gRPC reflection.
+    pub const FILE_DESCRIPTOR_SET: &[u8] =
+        include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
+}
+
+/// Largest message that either side of the protocol accepts, bytes. The largest are statuses:
+/// some 100 bytes a worker and a quarantined task.
+pub const MESSAGE_BYTES_MAX: usize = 4 << 20;

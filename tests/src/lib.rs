@@ -1,1 +1,12 @@
-//! End-to-end, golden and architecture tests.
+//! What the end-to-end, licence and architecture tests stand on: the workspace as cargo sees it,
+//! the built commands, processes that never outlive a test, datasets to compare, and requirements
+//! that are skipped loudly when this machine lacks them.
+
+pub mod binaries;
+pub mod city;
+pub mod dataset;
+pub mod process;
+pub mod requirement;
+pub mod scenes;
+pub mod sources;
+pub mod workspace;

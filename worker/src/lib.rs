@@ -1,1 +1,20 @@
 //! The worker: leases tasks, solves them, writes the results.
+//!
+//! - [`Worker`]: registers with a coordinator, works until the bake is over.
+//! - [`solve`]: what a task computes; a pure function of scene, plan and the rows it reads.
+//!
+//! Solving runs on a thread pool of its own, never on the runtime that talks to the coordinator,
+//! so heartbeats are on time however long a task takes. What a worker may write, and what a crash
+//! leaves behind, is described in `sightline_coordinator::journal`.
+
+mod attempt;
+mod cache;
+mod cell;
+mod connection;
+mod error;
+mod pool;
+pub mod solve;
+mod worker;
+
+pub use error::WorkerError;
+pub use worker::{Worker, WorkerOptions, WorkerSummary};

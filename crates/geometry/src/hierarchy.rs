@@ -12,7 +12,7 @@
 use glam::Vec3A;
 use obvhs::{Boundable, BvhBuildParams, aabb::Aabb, bvh2::builder::build_bvh2};
 
-use crate::Bounds32;
+use crate::{Bounds, Bounds32};
 
 /// One node, 32 bytes. `count == 0`: inner, children `first` and `first + 1`.
 /// `count > 0`: leaf over the items `first..first + count`.
@@ -90,6 +90,22 @@ impl Hierarchy {
             }
         }
         (out, order)
+    }
+
+    /// Calls `found` with every item whose leaf's box meets `query` (same space), in order.
+    pub fn items_in(&self, query: Bounds, mut found: impl FnMut(usize)) {
+        let mut stack: Vec<u32> = if self.nodes.is_empty() { vec![] } else { vec![0] };
+        while let Some(n) = stack.pop() {
+            let node = &self.nodes[n as usize];
+            if !node.bounds.widen().intersects(query) {
+                continue;
+            }
+            if node.is_leaf() {
+                (node.first..node.first + node.count).for_each(|item| found(item as usize));
+            } else {
+                stack.extend([node.first + 1, node.first]);
+            }
+        }
     }
 
     /// Panics when an invariant of the module does not hold over `boxes`, given in hierarchy order.

@@ -18,6 +18,7 @@ mod frame;
 mod hierarchy;
 mod ids;
 mod instanced;
+pub mod overlap;
 pub mod raycast;
 mod set;
 mod view;

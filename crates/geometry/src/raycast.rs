@@ -305,4 +305,17 @@ mod tests {
             assert!(caster.closest_occluder(&scene, ray, f64::INFINITY, |_| true).is_some());
         }
     }
+
+    #[test]
+    fn rays_in_the_border_of_a_box_meet_it() {
+        let scene = scene();
+        let mut caster = RayCaster::new();
+        for (x, y) in [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-1.0, -1.0), (1.0, 1.0)] {
+            for direction in [DVec3::NEG_Z, DVec3::new(0.0, -0.0, -1.0)] {
+                let ray = Ray { origin: DVec3::new(1e7 + x, y, 0.0), direction };
+                let hit = caster.closest_occluder(&scene, ray, f64::INFINITY, |_| true);
+                assert_eq!(hit.map(|h| h.distance), Some(2.0), "{x} {y}");
+            }
+        }
+    }
 }

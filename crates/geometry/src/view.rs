@@ -40,6 +40,15 @@ impl ViewCell {
         low + DVec3::Y * (h * self.height)
     }
 
+    /// Height of the lower surface at a point's x and z (bilinear over the footprint's box).
+    #[must_use]
+    pub fn floor_below(&self, point: DVec3) -> f64 {
+        let b = Bounds::of_points(self.corners);
+        let size = b.size();
+        let share = |p: f64, low: f64, size: f64| if size > 0.0 { (p - low) / size } else { 0.0 };
+        self.viewpoint(share(point.x, b.min.x, size.x), share(point.z, b.min.z, size.z), 0.0).y
+    }
+
     /// Centre of the cell.
     #[must_use]
     pub fn center(&self) -> DVec3 {
@@ -57,13 +66,10 @@ impl ViewCell {
     #[must_use]
     pub fn contains(&self, point: DVec3) -> bool {
         let b = self.bounds();
-        let size = b.size();
         if point.x < b.min.x || point.x > b.max.x || point.z < b.min.z || point.z > b.max.z {
             return false;
         }
-        let u = if size.x > 0.0 { (point.x - b.min.x) / size.x } else { 0.0 };
-        let v = if size.z > 0.0 { (point.z - b.min.z) / size.z } else { 0.0 };
-        let low = self.viewpoint(u, v, 0.0).y;
+        let low = self.floor_below(point);
         (low..=low + self.height).contains(&point.y)
     }
 }

@@ -1,1 +1,22 @@
-//! glTF scenes: reading, validation, numbering, view regions, generators.
+//! Scenes: glTF files to validated, numbered geometry.
+//!
+//! [`Scene::open`] reads a `.gltf` or `.glb` file into [`sightline_geometry::InstancedGeometry`]
+//! with a primitive numbering that is a function of the file alone, or refuses it with a
+//! [`SceneError`] that names the cause. Memory follows unique triangles, not instances.
+
+mod degenerate;
+mod digest;
+mod error;
+pub mod export;
+pub mod generate;
+mod gltf_reader;
+mod numbering;
+mod report;
+pub mod region;
+mod scene;
+
+pub use digest::{FileDigest, SceneDigest, digest};
+pub use error::{Cause, Place, SceneError, UriProblem};
+pub use numbering::morton;
+pub use report::{DegenerateTriangles, IngestReport, SkippedPrimitives};
+pub use scene::{InstanceSource, MeshSource, Object, OpenOptions, Scene};

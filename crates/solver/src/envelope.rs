@@ -155,8 +155,8 @@ pub fn insert(
     a: f64,
     b: f64,
 ) -> bool {
-    let first = list.iter().position(|p| p.t1 > a).unwrap_or(list.len());
-    let behind = list[first..].iter().position(|p| p.t0 >= b).map_or(list.len(), |k| first + k);
+    let first = list.partition_point(|p| p.t1 <= a);
+    let behind = first + list[first..].partition_point(|p| p.t0 < b);
     if first == behind {
         list.insert(first, Interval { t0: a, t1: b, cut: new });
         return true;
@@ -175,7 +175,6 @@ pub fn insert(
         let old_cut = &cuts[piece.cut as usize];
         push(scratch, piece.t0, s, piece.cut);
         let new_first = new_cut.primitive < old_cut.primitive;
-        // Nearer than the nearest point of the old one: no need to look at times.
         let nearer = decide(&new_line, &Line::new(old_cut, column), s, e, new_first);
         match nearer {
             Nearer::New => push(scratch, s, e, new),
@@ -215,7 +214,8 @@ pub fn unhidden_length(
 ) -> f64 {
     let line = Line::new(cut, column);
     let mut hidden = 0.0;
-    for piece in list.iter().skip_while(|p| p.t1 <= a).take_while(|p| p.t0 < b) {
+    let first = list.partition_point(|p| p.t1 <= a);
+    for piece in list[first..].iter().take_while(|p| p.t0 < b) {
         let (s, e) = (piece.t0.max(a), piece.t1.min(b));
         let old = Line::new(&cuts[piece.cut as usize], column);
         hidden += match decide(&line, &old, s, e, true) {

@@ -146,12 +146,6 @@ impl TileSolver {
         }
     }
 
-    /// The pixel lists of the last tile, for tests: (piece, primitive).
-    #[cfg(test)]
-    pub fn list(&self, pixel: usize) -> &[Interval] {
-        &self.lists[pixel]
-    }
-
     fn space(
         &self,
         context: &TileContext,
@@ -395,7 +389,8 @@ fn refresh(
     column: &Column,
     bins: std::ops::RangeInclusive<usize>,
 ) {
-    let mut pieces = list.iter().peekable();
+    let first = list.partition_point(|p| p.t1 * BINS as f64 <= *bins.start() as f64);
+    let mut pieces = list[first..].iter().peekable();
     for bin in bins {
         let (start, end) = (bin as f64 / BINS as f64, (bin + 1) as f64 / BINS as f64);
         let mut covered = start;

@@ -1,0 +1,390 @@
+//! Runs a plan to its end.
+//!
+//! [`Coordinator::start`] takes the steps of [`crate::journal`], serves workers, and returns a
+//! handle. Two tasks run on the caller's tokio runtime: the gRPC server, and a loop that wakes at
+//! every change and every tick, ends leases that ran out, and moves the phase on.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use sightline_jobs::{BakeStatus, Outcome, Phase, Plan, SchedulePolicy};
+use sightline_proto::v1::coordinator_server::CoordinatorServer;
+use sightline_proto::{MESSAGE_BYTES_MAX, v1};
+use sightline_store::BakeStore;
+use tokio::net::TcpListener;
+use tokio::sync::{oneshot, watch};
+use tokio::task::JoinHandle;
+use tokio_stream::wrappers::TcpListenerStream;
+
+use crate::CoordinatorError;
+use crate::clock::{Clock, MonotonicClock};
+use crate::dataset::Publish;
+use crate::journal::Journal;
+use crate::service::{Service, Shared};
+use crate::state::State;
+
+/// Shortest time between two looks at the state, ms: how fine progress is shown.
+const TICK_MS: u64 = 100;
+/// How long calls in flight may take at the end.
+const DRAIN_TIME: Duration = Duration::from_secs(2);
+/// Time between two looks for a newer epoch in the store, ms.
+const EPOCH_CHECK_MS: u64 = 5_000;
+
+/// How to run a bake.
+pub struct CoordinatorOptions {
+    /// Where to listen; port 0 takes a free one.
+    pub listen: SocketAddr,
+    /// Where the bake's state and the dataset go.
+    pub store: BakeStore,
+    /// The plan.
+    pub plan: Plan,
+    /// The last step.
+    pub publisher: Arc<dyn Publish>,
+    /// Leases and retries.
+    pub policy: SchedulePolicy,
+    /// How long to go on with no worker at hand; `None` waits for ever.
+    pub worker_wait: Option<Duration>,
+    /// How long to stay at the end, so that workers learn of it.
+    pub linger: Duration,
+    /// The clock that leases are measured with.
+    pub clock: Arc<dyn Clock>,
+}
+
+impl CoordinatorOptions {
+    /// Options with the defaults of the command.
+    #[must_use]
+    pub fn new(
+        listen: SocketAddr,
+        store: BakeStore,
+        plan: Plan,
+        publisher: Arc<dyn Publish>,
+    ) -> Self {
+        Self {
+            listen,
+            store,
+            plan,
+            publisher,
+            policy: SchedulePolicy::default(),
+            worker_wait: None,
+            linger: Duration::from_secs(5),
+            clock: Arc::new(MonotonicClock::default()),
+        }
+    }
+}
+
+/// How a bake ended with a dataset.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Summary {
+    /// Number of the current manifest.
+    pub manifest: u64,
+    /// False when this very dataset was current already.
+    pub changed: bool,
+    /// The last status, with counts and times.
+    pub status: BakeStatus,
+}
+
+/// The coordinator of a bake.
+pub struct Coordinator;
+
+/// A running coordinator. Dropping it stops the coordinator; the bake can be resumed.
+pub struct CoordinatorHandle {
+    /// Where it listens.
+    pub addr: SocketAddr,
+    status: watch::Receiver<BakeStatus>,
+    stop: Option<oneshot::Sender<()>>,
+    end: JoinHandle<Result<Summary, CoordinatorError>>,
+}
+
+impl CoordinatorHandle {
+    /// The address for workers on this machine, as a URL.
+    #[must_use]
+    pub fn url(&self) -> String {
+        format!("http://{}", self.addr)
+    }
+
+    /// The status, now and at every change.
+    #[must_use]
+    pub fn status(&self) -> watch::Receiver<BakeStatus> {
+        self.status.clone()
+    }
+
+    /// Asks the coordinator to stop. The bake can be resumed.
+    pub fn shutdown(&mut self) {
+        if let Some(stop) = self.stop.take() {
+            // It may have ended by itself.
+            let _ = stop.send(());
+        }
+    }
+
+    /// Waits for the end.
+    ///
+    /// # Errors
+    /// Why there is no dataset.
+    pub async fn join(self) -> Result<Summary, CoordinatorError> {
+        // Held until the end: a dropped sender would look like a request to stop.
+        let _stop = self.stop;
+        match self.end.await {
+            Ok(end) => end,
+            Err(error) => Err(CoordinatorError::Defect(error.to_string())),
+        }
+    }
+}
+
+impl Coordinator {
+    /// Starts a bake, or goes on with one, and serves workers.
+    ///
+    /// # Errors
+    /// When the store breaks its promises, holds another plan, or cannot be listened for.
+    pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, CoordinatorError> {
+        let listener = TcpListener::bind(options.listen)
+            .await
+            .map_err(|source| CoordinatorError::Listen { address: options.listen, source })?;
+        let addr = listener
+            .local_addr()
+            .map_err(|source| CoordinatorError::Listen { address: options.listen, source })?;
+        let (shared, status) = open_bake(&options, addr).await?;
+        let (stop, stopped) = oneshot::channel();
+        let (stop_server, server_stopped) = oneshot::channel();
+        let server = tokio::spawn(serve(listener, Arc::clone(&shared), server_stopped));
+        let run = Run { shared, options, addr, epoch_checked_ms: 0 };
+        let end = tokio::spawn(async move {
+            let end = run.to_the_end(stopped).await;
+            let _ = stop_server.send(());
+            match server.await {
+                Ok(Ok(())) => end,
+                Ok(Err(error)) => end.and(Err(CoordinatorError::Defect(error.to_string()))),
+                Err(error) => end.and(Err(CoordinatorError::Defect(error.to_string()))),
+            }
+        });
+        Ok(CoordinatorHandle { addr, status, stop: Some(stop), end })
+    }
+}
+
+/// The steps of [`crate::journal`].
+async fn open_bake(
+    options: &CoordinatorOptions,
+    addr: SocketAddr,
+) -> Result<(Arc<Shared>, watch::Receiver<BakeStatus>), CoordinatorError> {
+    let CoordinatorOptions { store, plan, policy, clock, .. } = options;
+    store.probe().await?;
+    let journal = Journal::new(store.clone(), &plan.bake_id);
+    journal.write_plan(plan).await?;
+    let epoch = journal.claim_epoch(&coordinator_name(addr)).await?;
+    let committed = journal.committed_tasks().await?;
+
+    let mut state = State::new(plan.clone(), epoch, *policy, clock.now_ms());
+    state.resume(committed);
+    state.enter(Phase::Solving, clock.now_ms());
+    let status = state.status(clock.now_ms());
+    tracing::info!(
+        bake = plan.bake_id,
+        epoch,
+        tasks = status.tasks.tasks,
+        resumed = status.tasks_resumed,
+        %addr,
+        "the bake starts"
+    );
+    let (status, watched) = watch::channel(status);
+    let shared = Shared {
+        state: std::sync::Mutex::new(state),
+        journal,
+        clock: Arc::clone(clock),
+        status,
+        changes: watch::channel(0).0,
+        store_location: absolute(store.location()),
+        scene_uri: absolute(&plan.scene.uri),
+        lease_ms: policy.lease_ms,
+    };
+    Ok((Arc::new(shared), watched))
+}
+
+/// Tells coordinators that race for an epoch apart: no two have the same address, process and
+/// start. Names only; nothing is decided by the time in it.
+fn coordinator_name(addr: SocketAddr) -> String {
+    let started = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)
+        .map_or(0, |since| since.as_nanos());
+    format!("{addr} process {} started {started}", std::process::id())
+}
+
+/// A path as workers elsewhere on this machine can use it; URLs stay as they are.
+fn absolute(location: &str) -> String {
+    if location.contains("://") {
+        return location.to_owned();
+    }
+    std::path::absolute(location)
+        .map_or_else(|_| location.to_owned(), |path| path.display().to_string())
+}
+
+async fn serve(
+    listener: TcpListener,
+    shared: Arc<Shared>,
+    stopped: oneshot::Receiver<()>,
+) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    let (health, health_service) = tonic_health::server::health_reporter();
+    health.set_serving::<CoordinatorServer<Service>>().await;
+    let reflection = tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
+        .build_v1()?;
+    let service = CoordinatorServer::new(Service(shared))
+        .max_decoding_message_size(MESSAGE_BYTES_MAX)
+        .max_encoding_message_size(MESSAGE_BYTES_MAX);
+    let (draining, drain) = oneshot::channel();
+    let server = tonic::transport::Server::builder()
+        .add_service(health_service)
+        .add_service(reflection)
+        .add_service(service)
+        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async {
+            // A dropped sender asks for the end too.
+            let _ = stopped.await;
+            let _ = draining.send(());
+        });
+    // Calls in flight get their answers, but nobody's open stream holds the end up.
+    let drained = async {
+        if drain.await.is_ok() {
+            tokio::time::sleep(DRAIN_TIME).await;
+        } else {
+            std::future::pending::<()>().await;
+        }
+    };
+    tokio::select! {
+        served = server => Ok(served?),
+        () = drained => Ok(()),
+    }
+}
+
+/// The loop of a running coordinator.
+struct Run {
+    shared: Arc<Shared>,
+    options: CoordinatorOptions,
+    addr: SocketAddr,
+    epoch_checked_ms: u64,
+}
+
+impl Run {
+    async fn to_the_end(
+        mut self,
+        stopped: oneshot::Receiver<()>,
+    ) -> Result<Summary, CoordinatorError> {
+        let shared = Arc::clone(&self.shared);
+        let end = tokio::select! {
+            end = self.solve_and_publish() => end,
+            _ = stopped => Err(CoordinatorError::Stopped),
+        };
+        // A coordinator that was stopped or replaced does not tell workers that the bake is over:
+        // they look for the next one.
+        let is_over =
+            !matches!(end, Err(CoordinatorError::Stopped | CoordinatorError::Superseded { .. }));
+        if !is_over {
+            shared.state().close();
+        }
+        match &end {
+            Ok(published) => shared.change(|s, now_ms| s.published(published.number, now_ms)),
+            Err(error) => shared.change(|s, now_ms| s.failed_for_good(error.to_string(), now_ms)),
+        }
+        shared.send_status();
+        if is_over {
+            self.linger().await;
+        }
+        let status = shared.status.borrow().clone();
+        let published = end?;
+        tracing::info!(manifest = published.number, "the dataset is published");
+        Ok(Summary { manifest: published.number, changed: published.changed, status })
+    }
+
+    async fn solve_and_publish(&mut self) -> Result<sightline_store::Published, CoordinatorError> {
+        self.solve().await?;
+        self.shared.change(|state, now_ms| state.enter(Phase::Merging, now_ms));
+        self.shared.send_status();
+        tracing::info!("all tasks are committed; the dataset is put together");
+        let publish = self.options.publisher.publish(&self.shared.journal, &self.options.plan);
+        tokio::pin!(publish);
+        loop {
+            // The state is looked after meanwhile: workers are waiting.
+            tokio::select! {
+                published = &mut publish => return published,
+                () = tokio::time::sleep(Duration::from_millis(TICK_MS)) => {
+                    self.shared.state().tick(self.shared.clock.now_ms());
+                    self.shared.send_status();
+                }
+            }
+        }
+    }
+
+    /// Until every task is committed.
+    async fn solve(&mut self) -> Result<(), CoordinatorError> {
+        let mut changes = self.shared.changes.subscribe();
+        loop {
+            changes.mark_unchanged();
+            self.end_lost_leases().await?;
+            self.check_epoch().await?;
+            self.shared.send_status();
+            match self.shared.state().outcome() {
+                Outcome::Complete => return Ok(()),
+                Outcome::Missing(missing) => return Err(CoordinatorError::Missing(missing)),
+                Outcome::Running => {}
+            }
+            self.check_workers()?;
+            // At most one look a tick, and at once when the last was longer ago.
+            tokio::time::sleep(Duration::from_millis(TICK_MS / 5)).await;
+            let _ = tokio::time::timeout(Duration::from_millis(TICK_MS), changes.changed()).await;
+        }
+    }
+
+    /// A worker that went silent may have committed first.
+    async fn end_lost_leases(&self) -> Result<(), CoordinatorError> {
+        let now_ms = self.shared.clock.now_ms();
+        let lost = self.shared.state().tick(now_ms);
+        for lease in &lost {
+            tracing::warn!(task = lease.task.0, worker = %lease.worker, "a lease ran out");
+            if self.shared.journal.commit(lease.task).await?.is_some() {
+                self.shared.change(|state, _| state.committed(lease.task, None));
+            }
+        }
+        if !lost.is_empty() {
+            self.shared.change(|_, _| ());
+        }
+        Ok(())
+    }
+
+    async fn check_epoch(&mut self) -> Result<(), CoordinatorError> {
+        let now_ms = self.shared.clock.now_ms();
+        if now_ms.saturating_sub(self.epoch_checked_ms) >= EPOCH_CHECK_MS {
+            self.epoch_checked_ms = now_ms;
+            let newest = self.shared.journal.newest_epoch().await?;
+            self.shared.state().see_epoch(newest);
+        }
+        let state = self.shared.state();
+        match state.newer_epoch() {
+            Some(newest) => Err(CoordinatorError::Superseded { own: state.epoch, newest }),
+            None => Ok(()),
+        }
+    }
+
+    fn check_workers(&self) -> Result<(), CoordinatorError> {
+        let waited_ms = self.shared.state().lonely_ms(self.shared.clock.now_ms());
+        match self.options.worker_wait {
+            Some(wait) if u128::from(waited_ms) > wait.as_millis() => {
+                Err(CoordinatorError::NoWorkers { waited_ms, address: self.addr })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Until all workers know that the bake is over, or the time for that is up.
+    async fn linger(&self) {
+        let all_told = async {
+            while self.shared.state().worker_count() > 0 {
+                tokio::time::sleep(Duration::from_millis(TICK_MS / 5)).await;
+                self.shared.state().tick(self.shared.clock.now_ms());
+            }
+        };
+        if tokio::time::timeout(self.options.linger, all_told).await.is_err() {
+            tracing::info!("some workers did not hear of the end");
+        } else {
+            // The last answer is still on its way out.
+            tokio::time::sleep(Duration::from_millis(TICK_MS)).await;
+        }
+    }
+}

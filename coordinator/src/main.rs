@@ -1,0 +1,110 @@
+//! `sightline-coordinator`: plans a bake, leases its tasks to workers, publishes the dataset.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::Parser;
+use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared, Summary, prepare};
+use sightline_jobs::BakeConfig;
+use sightline_store::BakeStore;
+
+/// Plans a bake, leases its tasks to workers, publishes the dataset.
+#[derive(Debug, Parser)]
+#[command(version, after_help = "Stop it at any time; the same command goes on with the bake.")]
+struct Arguments {
+    /// The scene, a .gltf or .glb file.
+    scene: PathBuf,
+    /// Where the dataset goes: a folder or an object store URL.
+    #[arg(long, value_name = "LOCATION")]
+    out: String,
+    /// The configuration of the bake.
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// A configuration key to set, over what the file says.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Address to listen on.
+    #[arg(long, default_value = "127.0.0.1:7070", env = "SIGHTLINE_LISTEN")]
+    listen: SocketAddr,
+    /// How long a task stays with a worker that is silent, ms.
+    #[arg(long, default_value_t = 30_000, value_parser = clap::value_parser!(u64).range(100..))]
+    lease_ms: u64,
+    /// Give up after this time without any worker, s. Without it, wait for ever.
+    #[arg(long, value_name = "SECONDS")]
+    worker_wait: Option<u64>,
+}
+
+type Error = Box<dyn std::error::Error + Send + Sync>;
+
+#[tokio::main]
+async fn main() -> ExitCode {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    match run(Arguments::parse()).await {
+        Ok(summary) => {
+            tracing::info!(
+                manifest = summary.manifest,
+                changed = summary.changed,
+                cells = summary.status.cells.total,
+                solve_ms = summary.status.solve_ms,
+                merge_ms = summary.status.merge_ms,
+                "done"
+            );
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            tracing::error!("{error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+async fn run(arguments: Arguments) -> Result<Summary, Error> {
+    let text = std::fs::read_to_string(&arguments.config)
+        .map_err(|error| format!("{}: {error}", arguments.config.display()))?;
+    let overrides = arguments
+        .overrides
+        .iter()
+        .map(|text| text.split_once('=').ok_or(format!("--set {text}: write KEY=VALUE")))
+        .collect::<Result<Vec<_>, _>>()?;
+    let config = BakeConfig::from_toml_with(&text, &overrides)?;
+    let store = BakeStore::open_or_create(&arguments.out)?;
+    let scene = arguments.scene.clone();
+    let Prepared { plan, publisher, scene: _ } =
+        tokio::task::spawn_blocking(move || prepare(&scene, config)).await??;
+
+    let mut options = CoordinatorOptions::new(arguments.listen, store, plan, Arc::new(publisher));
+    options.policy.lease_ms = arguments.lease_ms;
+    options.worker_wait = arguments.worker_wait.map(Duration::from_secs);
+    let mut coordinator = Coordinator::start(options).await?;
+    let mut status = coordinator.status();
+    let ended = async { status.wait_for(|s| s.phase.is_final()).await.map(drop) };
+    tokio::select! {
+        _ = ended => {}
+        () = signalled() => coordinator.shutdown(),
+    }
+    Ok(coordinator.join().await?)
+}
+
+/// Until someone asks the process to stop.
+async fn signalled() {
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
+            tokio::select! {
+                _ = terminate.recv() => {}
+                _ = tokio::signal::ctrl_c() => {}
+            }
+            return;
+        }
+    }
+    // Without a handler the default action applies: the process ends.
+    if tokio::signal::ctrl_c().await.is_err() {
+        std::future::pending::<()>().await;
+    }
+}

@@ -1,0 +1,304 @@
+//! The gRPC service: requests to the state, and the state to answers.
+//!
+//! Nothing here computes or waits for the store while it holds the state.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use futures::stream;
+use sightline_jobs::{BakeStatus, FORMAT_VERSION, FailureClass, Lease, LeaseId, TaskId, WorkerId};
+use sightline_proto::v1::{self, coordinator_server, lease_response::Answer, report_request};
+use tokio::sync::watch;
+use tonic::{Request, Response, Status};
+
+use crate::clock::Clock;
+use crate::journal::Journal;
+use crate::state::State;
+
+/// How long a lease request waits for a task before it is answered with "wait", ms. Well under
+/// the clients' timeouts; long enough that waiting workers cost nothing.
+const LEASE_WAIT_MS: u64 = 1_000;
+/// Longest worker name and failure reason that are kept, bytes: they end up in statuses.
+const TEXT_BYTES_MAX: usize = 2_000;
+
+/// What the service and the coordinator's loop share.
+pub(crate) struct Shared {
+    pub state: Mutex<State>,
+    pub journal: Journal,
+    pub clock: Arc<dyn Clock>,
+    /// The status, sent by the coordinator's loop.
+    pub status: watch::Sender<BakeStatus>,
+    /// Counts changes of the state: wakes the loop, and lease requests that wait for a task.
+    pub changes: watch::Sender<u64>,
+    pub store_location: String,
+    pub scene_uri: String,
+    pub lease_ms: u64,
+}
+
+impl Shared {
+    pub fn state(&self) -> MutexGuard<'_, State> {
+        // A panic while the state is held is a defect; the state itself stays whole.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Changes the state, then lets everyone know.
+    pub fn change<T>(&self, change: impl FnOnce(&mut State, u64) -> T) -> T {
+        let now_ms = self.clock.now_ms();
+        let mut state = self.state();
+        let out = change(&mut state, now_ms);
+        drop(state);
+        self.changes.send_modify(|count| *count += 1);
+        out
+    }
+
+    /// Sends the status to whoever watches.
+    pub fn send_status(&self) {
+        let status = self.state().status(self.clock.now_ms());
+        self.status.send_replace(status);
+    }
+}
+
+/// The gRPC service.
+pub(crate) struct Service(pub Arc<Shared>);
+
+impl Service {
+    /// Refuses messages of another epoch and of workers that are not registered.
+    fn admit(&self, epoch: u64, worker: u32) -> Result<WorkerId, Status> {
+        let mut state = self.0.state();
+        state.see_epoch(epoch);
+        if state.is_closed() {
+            return Err(closing());
+        }
+        if epoch != state.epoch {
+            return Err(other_epoch(epoch, state.epoch));
+        }
+        let worker = WorkerId(worker);
+        if !state.knows(worker) {
+            return Err(Status::not_found("this worker is not registered; register again"));
+        }
+        Ok(worker)
+    }
+
+    /// A task, or the end. Not a change when there is neither: waiting workers would keep waking
+    /// each other.
+    fn try_lease(&self, worker: WorkerId) -> Option<Answer> {
+        let now_ms = self.0.clock.now_ms();
+        let mut state = self.0.state();
+        let answer = if let Some(ending) = state.ending() {
+            // Who has been told needs nothing more from us.
+            state.leave(worker);
+            Answer::Finished(v1::Finished { published: ending.published, message: ending.message })
+        } else {
+            let lease = state.lease(worker, now_ms)?;
+            let attempt = attempt_name(&state, &lease);
+            tracing::debug!(task = lease.task.0, attempt, "leased");
+            Answer::Task(v1::LeasedTask { task: lease.task.0, lease_id: lease.id.0, attempt })
+        };
+        drop(state);
+        self.0.changes.send_modify(|count| *count += 1);
+        Some(answer)
+    }
+
+    /// Believes a commit object, not a message.
+    async fn commit_reported(
+        &self,
+        worker: WorkerId,
+        task: TaskId,
+        lease: LeaseId,
+        solve_ms: u64,
+    ) -> Result<(), Status> {
+        let found = self.0.journal.commit(task).await;
+        match found {
+            Ok(Some(_)) => {
+                self.0.change(|state, _| state.committed(task, Some((worker, solve_ms))));
+                Ok(())
+            }
+            Ok(None) => {
+                let reason = "reported as committed, and there is no commit";
+                self.failed(lease, FailureClass::RetryElsewhere, reason);
+                Err(Status::data_loss(reason))
+            }
+            Err(error) => Err(Status::unavailable(error.to_string())),
+        }
+    }
+
+    fn failed(&self, lease: LeaseId, class: FailureClass, reason: &str) {
+        self.0.change(|state, now_ms| state.attempt_failed(lease, class, reason, now_ms));
+    }
+}
+
+/// A name that no other attempt of this bake has, on whatever coordinator: epochs are taken once,
+/// and lease numbers are given once an epoch.
+fn attempt_name(state: &State, lease: &Lease) -> String {
+    format!("e{}-w{}-l{}", state.epoch, lease.worker, lease.id)
+}
+
+fn other_epoch(theirs: u64, ours: u64) -> Status {
+    Status::failed_precondition(format!(
+        "the message is of epoch {theirs}, this coordinator of epoch {ours}; register again"
+    ))
+}
+
+fn closing() -> Status {
+    Status::unavailable("this coordinator is ending before the bake does; try again")
+}
+
+fn shortened(mut text: String) -> String {
+    if text.len() > TEXT_BYTES_MAX {
+        text.truncate(text.floor_char_boundary(TEXT_BYTES_MAX));
+    }
+    text
+}
+
+#[tonic::async_trait]
+impl coordinator_server::Coordinator for Service {
+    async fn register(
+        &self,
+        request: Request<v1::RegisterRequest>,
+    ) -> Result<Response<v1::RegisterResponse>, Status> {
+        let request = request.into_inner();
+        if request.format_version != FORMAT_VERSION {
+            return Err(Status::invalid_argument(format!(
+                "the worker writes format version {}, this bake has {FORMAT_VERSION}; run the \
+                 same version of both",
+                request.format_version
+            )));
+        }
+        let shared = &self.0;
+        shared.change(|state, now_ms| {
+            state.see_epoch(request.newest_epoch);
+            if state.is_closed() {
+                return Err(closing());
+            }
+            if request.newest_epoch > state.epoch {
+                return Err(other_epoch(request.newest_epoch, state.epoch));
+            }
+            let name = shortened(request.worker_name);
+            tracing::info!(worker = %name, threads = request.threads, "a worker joins");
+            let worker = state.join(name, request.threads, now_ms);
+            Ok(Response::new(v1::RegisterResponse {
+                worker_id: worker.0,
+                epoch: state.epoch,
+                bake_id: state.plan.bake_id.clone(),
+                store_location: shared.store_location.clone(),
+                scene_uri: shared.scene_uri.clone(),
+                scene_digest: state.plan.scene.digest.clone(),
+                lease_ms: shared.lease_ms,
+                // Two heartbeats may get lost.
+                heartbeat_ms: (shared.lease_ms / 3).max(1),
+            }))
+        })
+    }
+
+    async fn lease(
+        &self,
+        request: Request<v1::LeaseRequest>,
+    ) -> Result<Response<v1::LeaseResponse>, Status> {
+        let request = request.into_inner();
+        let mut changes = self.0.changes.subscribe();
+        let give_up =
+            tokio::time::sleep(Duration::from_millis(LEASE_WAIT_MS.min(self.0.lease_ms / 3)));
+        tokio::pin!(give_up);
+        loop {
+            let worker = self.admit(request.epoch, request.worker_id)?;
+            changes.mark_unchanged();
+            if let Some(answer) = self.try_lease(worker) {
+                return Ok(Response::new(v1::LeaseResponse { answer: Some(answer) }));
+            }
+            let gave_up = tokio::select! {
+                () = &mut give_up => true,
+                changed = changes.changed() => changed.is_err(),
+            };
+            if gave_up {
+                let answer = Some(Answer::Wait(v1::Wait { retry_after_ms: 10 }));
+                return Ok(Response::new(v1::LeaseResponse { answer }));
+            }
+        }
+    }
+
+    async fn heartbeat(
+        &self,
+        request: Request<v1::HeartbeatRequest>,
+    ) -> Result<Response<v1::HeartbeatResponse>, Status> {
+        let request = request.into_inner();
+        let worker = self.admit(request.epoch, request.worker_id)?;
+        let held: Vec<LeaseId> = request.lease_ids.into_iter().map(LeaseId).collect();
+        let now_ms = self.0.clock.now_ms();
+        let lost = self.0.state().heartbeat(worker, &held, now_ms);
+        let lost_lease_ids = lost.into_iter().map(|lease| lease.0).collect();
+        Ok(Response::new(v1::HeartbeatResponse { lost_lease_ids }))
+    }
+
+    async fn report(
+        &self,
+        request: Request<v1::ReportRequest>,
+    ) -> Result<Response<v1::ReportResponse>, Status> {
+        let request = request.into_inner();
+        let worker = self.admit(request.epoch, request.worker_id)?;
+        let (task, lease) = (TaskId(request.task), LeaseId(request.lease_id));
+        if task.index() >= self.0.state().plan.tasks.len() {
+            return Err(Status::invalid_argument(format!("the plan has no task {task}")));
+        }
+        match request.result {
+            Some(report_request::Result::Committed(done)) => {
+                self.commit_reported(worker, task, lease, done.solve_ms).await?;
+            }
+            Some(report_request::Result::Failed(failed)) => {
+                let class = FailureClass::try_from(failed.class())
+                    .map_err(|error| Status::invalid_argument(error.to_string()))?;
+                let name = self.0.state().name_of(worker).to_owned();
+                let reason = shortened(format!("{name}: {}", failed.reason));
+                tracing::warn!(task = task.0, ?class, reason, "an attempt failed");
+                self.failed(lease, class, &reason);
+            }
+            Some(report_request::Result::Released(_)) => {
+                self.0.change(|state, _| state.release(lease));
+            }
+            None => return Err(Status::invalid_argument("a ReportRequest has no `result`")),
+        }
+        Ok(Response::new(v1::ReportResponse {}))
+    }
+
+    async fn goodbye(
+        &self,
+        request: Request<v1::GoodbyeRequest>,
+    ) -> Result<Response<v1::GoodbyeResponse>, Status> {
+        let request = request.into_inner();
+        let worker = self.admit(request.epoch, request.worker_id)?;
+        self.0.change(|state, _| {
+            tracing::info!(worker = state.name_of(worker), "a worker leaves");
+            state.leave(worker);
+        });
+        Ok(Response::new(v1::GoodbyeResponse {}))
+    }
+
+    async fn get_status(
+        &self,
+        _: Request<v1::GetStatusRequest>,
+    ) -> Result<Response<v1::Status>, Status> {
+        let now_ms = self.0.clock.now_ms();
+        let status = self.0.state().status(now_ms);
+        Ok(Response::new((&status).into()))
+    }
+
+    type WatchStatusStream =
+        std::pin::Pin<Box<dyn futures::Stream<Item = Result<v1::Status, Status>> + Send>>;
+
+    async fn watch_status(
+        &self,
+        _: Request<v1::WatchStatusRequest>,
+    ) -> Result<Response<Self::WatchStatusStream>, Status> {
+        let watched = self.0.status.subscribe();
+        let statuses = stream::unfold((watched, false), |(mut watched, is_waiting)| async move {
+            if is_waiting {
+                let has_ended = watched.borrow().phase.is_final();
+                if has_ended || watched.changed().await.is_err() {
+                    return None;
+                }
+            }
+            let status = v1::Status::from(&*watched.borrow_and_update());
+            Some((Ok(status), (watched, true)))
+        });
+        Ok(Response::new(Box::pin(statuses)))
+    }
+}

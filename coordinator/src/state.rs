@@ -1,0 +1,269 @@
+//! What a running coordinator knows: the scheduler, its workers, and the status made from them.
+
+use std::collections::BTreeMap;
+
+use sightline_jobs::{
+    BakeStatus, Done, FailureClass, Lease, LeaseId, Outcome, Phase, Plan, QuarantinedTask,
+    SchedulePolicy, Scheduler, TaskId, TaskKind, WorkerId, WorkerStatus,
+};
+
+/// A registered worker.
+#[derive(Clone, Debug)]
+struct Registered {
+    name: String,
+    threads: u32,
+    tasks_committed: u32,
+}
+
+/// Why a bake ends.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Ending {
+    pub published: bool,
+    pub message: String,
+}
+
+/// The state of a running coordinator. Times are in ms of the coordinator's clock.
+#[derive(Debug)]
+pub(crate) struct State {
+    pub plan: Plan,
+    pub epoch: u64,
+    scheduler: Scheduler,
+    registered: BTreeMap<WorkerId, Registered>,
+    phase: Phase,
+    phase_since_ms: u64,
+    started_ms: u64,
+    solve_ms: u64,
+    merge_ms: u64,
+    worker_solve_ms: u64,
+    tasks_resumed: u32,
+    units_resumed: u64,
+    /// When a worker was last at hand.
+    workers_seen_ms: u64,
+    manifest: u64,
+    ending: Option<Ending>,
+    /// The coordinator ends and the bake does not: workers are to look for the next one.
+    is_closed: bool,
+    /// The newest epoch that anybody showed us, when it is newer than ours.
+    newer_epoch: Option<u64>,
+}
+
+impl State {
+    pub fn new(plan: Plan, epoch: u64, policy: SchedulePolicy, now_ms: u64) -> Self {
+        let scheduler = Scheduler::new(&plan.tasks, policy);
+        Self {
+            plan,
+            epoch,
+            scheduler,
+            registered: BTreeMap::new(),
+            phase: Phase::Planning,
+            phase_since_ms: now_ms,
+            started_ms: now_ms,
+            solve_ms: 0,
+            merge_ms: 0,
+            worker_solve_ms: 0,
+            tasks_resumed: 0,
+            units_resumed: 0,
+            workers_seen_ms: now_ms,
+            manifest: 0,
+            ending: None,
+            is_closed: false,
+            newer_epoch: None,
+        }
+    }
+
+    /// Takes over the tasks that were committed before this coordinator.
+    pub fn resume(&mut self, committed: impl IntoIterator<Item = TaskId>) {
+        for task in committed {
+            if task.index() < self.plan.tasks.len() && self.scheduler.committed(task) {
+                self.tasks_resumed += 1;
+            }
+        }
+        self.units_resumed = self.scheduler.units_committed(|_| true);
+    }
+
+    /// Moves on to a phase; the time spent in the one before is added up.
+    pub fn enter(&mut self, phase: Phase, now_ms: u64) {
+        let spent = now_ms.saturating_sub(self.phase_since_ms);
+        match self.phase {
+            Phase::Solving => self.solve_ms += spent,
+            Phase::Merging => self.merge_ms += spent,
+            Phase::Planning | Phase::Published | Phase::Failed => {}
+        }
+        (self.phase, self.phase_since_ms) = (phase, now_ms);
+    }
+
+    pub fn published(&mut self, manifest: u64, now_ms: u64) {
+        self.manifest = manifest;
+        self.enter(Phase::Published, now_ms);
+        self.end(true, "the dataset is published".into());
+    }
+
+    pub fn failed_for_good(&mut self, message: String, now_ms: u64) {
+        self.enter(Phase::Failed, now_ms);
+        self.end(false, message);
+    }
+
+    fn end(&mut self, published: bool, message: String) {
+        self.ending.get_or_insert(Ending { published, message });
+    }
+
+    pub const fn close(&mut self) {
+        self.is_closed = true;
+    }
+
+    pub const fn is_closed(&self) -> bool {
+        self.is_closed
+    }
+
+    pub fn ending(&self) -> Option<Ending> {
+        self.ending.clone()
+    }
+
+    /// Notes an epoch that somebody showed us.
+    pub fn see_epoch(&mut self, epoch: u64) {
+        if epoch > self.epoch {
+            self.newer_epoch = self.newer_epoch.max(Some(epoch));
+        }
+    }
+
+    pub const fn newer_epoch(&self) -> Option<u64> {
+        self.newer_epoch
+    }
+
+    pub fn join(&mut self, name: String, threads: u32, now_ms: u64) -> WorkerId {
+        let id = self.scheduler.join(now_ms);
+        self.registered.insert(id, Registered { name, threads, tasks_committed: 0 });
+        id
+    }
+
+    pub fn knows(&self, worker: WorkerId) -> bool {
+        self.scheduler.knows(worker)
+    }
+
+    pub fn name_of(&self, worker: WorkerId) -> &str {
+        self.registered.get(&worker).map_or("?", |w| w.name.as_str())
+    }
+
+    pub fn leave(&mut self, worker: WorkerId) {
+        self.scheduler.leave(worker);
+        self.registered.remove(&worker);
+    }
+
+    pub fn worker_count(&self) -> usize {
+        self.scheduler.worker_count()
+    }
+
+    pub fn lease(&mut self, worker: WorkerId, now_ms: u64) -> Option<Lease> {
+        self.scheduler.heartbeat(worker, &[], now_ms);
+        (self.phase == Phase::Solving).then(|| self.scheduler.lease(worker, now_ms)).flatten()
+    }
+
+    pub fn heartbeat(&mut self, worker: WorkerId, held: &[LeaseId], now_ms: u64) -> Vec<LeaseId> {
+        self.scheduler.heartbeat(worker, held, now_ms)
+    }
+
+    pub fn committed(&mut self, task: TaskId, by: Option<(WorkerId, u64)>) {
+        let is_news = self.scheduler.committed(task);
+        if let Some((worker, solve_ms)) = by {
+            self.worker_solve_ms += solve_ms;
+            if let Some(worker) = self.registered.get_mut(&worker).filter(|_| is_news) {
+                worker.tasks_committed += 1;
+            }
+        }
+    }
+
+    pub fn attempt_failed(
+        &mut self,
+        lease: LeaseId,
+        class: FailureClass,
+        reason: &str,
+        now_ms: u64,
+    ) {
+        self.scheduler.failed(lease, class, reason, now_ms);
+    }
+
+    pub fn release(&mut self, lease: LeaseId) {
+        self.scheduler.release(lease);
+    }
+
+    /// Ends what ran out. Forgets silent workers. Returns the leases that were lost.
+    pub fn tick(&mut self, now_ms: u64) -> Vec<Lease> {
+        let lost = self.scheduler.expire(now_ms);
+        let scheduler = &self.scheduler;
+        self.registered.retain(|worker, _| scheduler.knows(*worker));
+        if self.worker_count() > 0 {
+            self.workers_seen_ms = now_ms;
+        }
+        lost
+    }
+
+    /// For how long there has been no worker, ms.
+    pub const fn lonely_ms(&self, now_ms: u64) -> u64 {
+        now_ms.saturating_sub(self.workers_seen_ms)
+    }
+
+    pub fn outcome(&self) -> Outcome {
+        self.scheduler.outcome()
+    }
+
+    pub fn status(&self, now_ms: u64) -> BakeStatus {
+        let missing = self.scheduler.missing();
+        let in_phase = |phase| {
+            if self.phase == phase { now_ms.saturating_sub(self.phase_since_ms) } else { 0 }
+        };
+        let solve_ms = self.solve_ms + in_phase(Phase::Solving);
+        let cells = self.done(|kind| matches!(kind, TaskKind::Cells { .. }), self.plan.cells.len());
+        let segments =
+            self.done(|kind| matches!(kind, TaskKind::Segments { .. }), self.plan.segments.len());
+        let units = (cells.done + segments.done).saturating_sub(self.units_resumed);
+        BakeStatus {
+            bake_id: self.plan.bake_id.clone(),
+            epoch: self.epoch,
+            phase: self.phase,
+            tasks: self.scheduler.progress(),
+            cells,
+            segments,
+            tasks_resumed: self.tasks_resumed,
+            workers: self.worker_statuses(),
+            quarantined: missing
+                .quarantined
+                .into_iter()
+                .map(|(task, reason)| QuarantinedTask { task, reason })
+                .collect(),
+            tasks_blocked: u32::try_from(missing.blocked.len()).unwrap_or(u32::MAX),
+            elapsed_ms: now_ms.saturating_sub(self.started_ms),
+            solve_ms,
+            merge_ms: self.merge_ms + in_phase(Phase::Merging),
+            worker_solve_ms: self.worker_solve_ms,
+            units_per_second: if solve_ms == 0 {
+                0.0
+            } else {
+                units as f64 * 1000.0 / solve_ms as f64
+            },
+            manifest: self.manifest,
+            error: match &self.ending {
+                Some(ending) if !ending.published => ending.message.clone(),
+                _ => String::new(),
+            },
+        }
+    }
+
+    fn done(&self, counts: impl Fn(&TaskKind) -> bool, total: usize) -> Done {
+        let done = self.scheduler.units_committed(|task| counts(&self.plan.task(task).kind));
+        Done { done, total: total as u64 }
+    }
+
+    fn worker_statuses(&self) -> Vec<WorkerStatus> {
+        let leases = self.scheduler.workers();
+        self.registered
+            .iter()
+            .map(|(id, worker)| WorkerStatus {
+                id: id.0,
+                name: worker.name.clone(),
+                threads: worker.threads,
+                leases: leases.get(id).copied().unwrap_or(0),
+                tasks_committed: worker.tasks_committed,
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,219 @@
+//! Datasets and their scenes, as the commands open them.
+//!
+//! The scene of a dataset is, in this order: the one given by `--scene`; where a bake in the
+//! dataset's folder read it; a file of its name beside or in the dataset's folder. Whichever it
+//! is, its digest has to be the one in the manifest: primitive numbers mean nothing in another
+//! scene.
+
+use std::path::{Path, PathBuf};
+
+use futures::TryStreamExt;
+use serde_json::{Value, json};
+use sightline_jobs::Plan;
+use sightline_scene::{OpenOptions, Scene, SceneDigest};
+use sightline_store::{BakeStore, Dataset, Manifest, keys};
+
+use crate::arguments::DatasetInput;
+use crate::failure::{Failure, Kind, Result};
+use crate::progress::note;
+
+/// Opens the dataset in a folder.
+pub async fn open(location: &str) -> Result<Dataset> {
+    Ok(Dataset::open(&BakeStore::open(location)?).await?)
+}
+
+/// Opens a dataset and the scene that it was baked from; the scene's path comes with it.
+pub async fn open_with_scene(input: &DatasetInput) -> Result<(Dataset, Scene, PathBuf)> {
+    let dataset = open(&input.dataset).await?;
+    let path = find_scene(&dataset, input).await?;
+    let scene = Scene::open(&path, &open_options(dataset.manifest()))?;
+    expect_digest(dataset.manifest(), &scene.digest, &path)?;
+    Ok((dataset, scene, path))
+}
+
+/// How the bake read the scene: see-through patterns decide what hides what.
+fn open_options(manifest: &Manifest) -> OpenOptions {
+    let patterns = manifest.config["scene"]["see_through"].as_array();
+    let mut options = OpenOptions::default();
+    options.see_through =
+        patterns.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect();
+    options
+}
+
+async fn find_scene(dataset: &Dataset, input: &DatasetInput) -> Result<PathBuf> {
+    if let Some(path) = &input.scene {
+        return Ok(path.clone());
+    }
+    let source = &dataset.manifest().scene;
+    let folder = Path::new(input.dataset.strip_prefix("file://").unwrap_or(&input.dataset));
+    let mut candidates = Vec::new();
+    for plan in plans(dataset.store()).await? {
+        if plan.scene.digest == source.hash {
+            candidates.push(scene_path(&plan.scene.uri));
+        }
+    }
+    candidates.push(folder.join("..").join(&source.uri));
+    candidates.push(folder.join(&source.uri));
+    for path in &candidates {
+        if path.is_file() && sightline_scene::digest(path).is_ok_and(|d| d.combined == source.hash)
+        {
+            return Ok(path.clone());
+        }
+    }
+    let looked: Vec<String> = candidates.iter().map(|p| p.display().to_string()).collect();
+    Err(Failure::new(
+        Kind::Input,
+        format!("the scene `{}` of this dataset was not found: {}", source.uri, looked.join(", ")),
+    )
+    .with_help("give the scene that was baked with --scene"))
+}
+
+/// The file that a scene's URI names.
+fn scene_path(uri: &str) -> PathBuf {
+    PathBuf::from(uri.strip_prefix("file://").unwrap_or(uri))
+}
+
+fn expect_digest(manifest: &Manifest, found: &SceneDigest, path: &Path) -> Result<()> {
+    if found.combined == manifest.scene.hash {
+        return Ok(());
+    }
+    let old: Vec<(&str, &str)> =
+        manifest.scene.files.iter().map(|f| (f.name.as_str(), f.blake3.as_str())).collect();
+    let changes = changed_files(&old, found);
+    Err(Failure::new(
+        Kind::Input,
+        format!("`{}` is not the scene that was baked: {}", path.display(), changes.join("; ")),
+    )
+    .with_help("give the scene that was baked with --scene, or bake this one"))
+}
+
+/// What differs between the files of two scenes, one sentence each; `old` is (name, BLAKE3).
+pub fn changed_files(old: &[(&str, &str)], new: &SceneDigest) -> Vec<String> {
+    let mut changes = Vec::new();
+    for (name, hash) in old {
+        match new.files.iter().find(|f| f.name == *name) {
+            None => changes.push(format!("scene file `{name}` is not part of it any more")),
+            Some(f) if f.blake3 != *hash => changes.push(format!("scene file `{name}` changed")),
+            Some(_) => {}
+        }
+    }
+    for file in &new.files {
+        if !old.iter().any(|(name, _)| *name == file.name) {
+            changes.push(format!("scene file `{}` is new", file.name));
+        }
+    }
+    if changes.is_empty() {
+        changes.push("its files come in another order".into());
+    }
+    changes
+}
+
+/// The plans of all bakes in a store. What cannot be read, of another version say, is left out.
+pub async fn plans(store: &BakeStore) -> Result<Vec<Plan>> {
+    let mut plans = Vec::new();
+    for key in store.list(keys::BAKE_FOLDER).await? {
+        if !key.ends_with("/plan.bin") {
+            continue;
+        }
+        match sightline_proto::decode_plan(&store.get(&key).await?) {
+            Ok(plan) => plans.push(plan),
+            Err(error) => note(&format!("`{key}` is left out: {error}")),
+        }
+    }
+    Ok(plans)
+}
+
+/// Figures over all cells of a dataset.
+#[derive(Clone, Debug, Default)]
+pub struct Summary {
+    /// Cells with a set.
+    pub cells: u64,
+    /// Primitives of the scene.
+    pub primitives: u64,
+    /// Mean number of visible primitives a cell.
+    pub visible_mean: f64,
+    /// Largest number of visible primitives of a cell.
+    pub visible_max: u64,
+    /// Rays that measured the error while baking.
+    pub heldout_rays: u64,
+    /// Mean held-out pixel error over the cells, share of pixels.
+    pub error_mean: f64,
+    /// Held-out pixel error of the worst viewpoint of all cells, share of pixels.
+    pub error_max: f64,
+    /// Refinement rounds of all cells.
+    pub refinements: u64,
+}
+
+impl Summary {
+    /// Reads all cells.
+    pub async fn of(dataset: &Dataset) -> Result<Self> {
+        let mut out =
+            Self { primitives: dataset.manifest().scene.triangles, ..Self::default() };
+        let (mut visible, mut error) = (0u64, 0.0f64);
+        let mut rows = std::pin::pin!(dataset.cell_rows());
+        while let Some(row) = rows.try_next().await? {
+            let members = row.set.len();
+            out.cells += 1;
+            visible += members;
+            out.visible_max = out.visible_max.max(members);
+            out.heldout_rays += row.heldout_rays;
+            out.refinements += u64::from(row.refinements);
+            error += row.heldout_error_mean;
+            out.error_max = out.error_max.max(row.heldout_error_max);
+        }
+        let cells = out.cells.max(1) as f64;
+        (out.visible_mean, out.error_mean) = (visible as f64 / cells, error / cells);
+        Ok(out)
+    }
+
+    /// The figures as JSON.
+    pub fn to_json(&self) -> Value {
+        json!({
+            "cells": self.cells,
+            "primitives": self.primitives,
+            "visible_mean": self.visible_mean,
+            "visible_max": self.visible_max,
+            "reduction": self.reduction(),
+            "heldout_rays": self.heldout_rays,
+            "heldout_error_mean": self.error_mean,
+            "heldout_error_max": self.error_max,
+            "refinements": self.refinements,
+        })
+    }
+
+    /// Primitives of the scene for each visible one, on average; absent when nothing is visible.
+    pub fn reduction(&self) -> Option<f64> {
+        (self.visible_mean > 0.0).then(|| self.primitives as f64 / self.visible_mean)
+    }
+
+    /// Adds the figures to a table.
+    pub fn add_to(&self, table: &mut crate::report::Table) {
+        use crate::report::{percent, thousands};
+        table.row("cells", thousands(self.cells)).row("triangles", thousands(self.primitives));
+        if self.cells == 0 {
+            return;
+        }
+        table.row(
+            "visible a cell",
+            format!(
+                "mean {}, max {}",
+                thousands(self.visible_mean.round() as u64),
+                thousands(self.visible_max)
+            ),
+        );
+        if let Some(factor) = self.reduction() {
+            table.row("reduction", format!("{factor:.1} times fewer triangles"));
+        }
+        if self.heldout_rays > 0 {
+            table.row(
+                "pixel error",
+                format!(
+                    "mean {}, worst viewpoint {} ({} held-out rays)",
+                    percent(self.error_mean),
+                    percent(self.error_max),
+                    thousands(self.heldout_rays)
+                ),
+            );
+        }
+    }
+}

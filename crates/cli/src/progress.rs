@@ -1,0 +1,122 @@
+//! Progress on stderr: a bar on a terminal, a line now and then elsewhere, nothing when quiet.
+//!
+//! Log lines and the bar share stderr without tearing each other: both go through one
+//! [`indicatif::MultiProgress`].
+
+use std::io::{self, IsTerminal, Write};
+use std::sync::LazyLock;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+
+use crate::report::{duration, thousands};
+
+static BARS: LazyLock<MultiProgress> = LazyLock::new(MultiProgress::new);
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// Pause between the lines where there is no terminal.
+const PLAIN_EVERY: Duration = Duration::from_secs(5);
+
+/// Switches progress and notes off.
+pub fn be_quiet() {
+    QUIET.store(true, Ordering::Relaxed);
+}
+
+/// A remark on stderr, above the bar; left out when quiet.
+pub fn note(text: &str) {
+    if !QUIET.load(Ordering::Relaxed) {
+        always(text);
+    }
+}
+
+/// A line on stderr even when quiet.
+pub fn always(text: &str) {
+    BARS.suspend(|| {
+        // Nothing sensible is left to do when stderr does not take the text.
+        let _ = writeln!(io::stderr(), "{text}");
+    });
+}
+
+/// How far a command is.
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    what: &'static str,
+    unit: &'static str,
+    total: u64,
+    started: Instant,
+    last_line: Instant,
+    /// Where it stood when it began: a resumed bake does not count what was there.
+    from: Option<u64>,
+}
+
+impl Progress {
+    /// Progress towards `total` units, a noun in the plural.
+    pub fn new(what: &'static str, unit: &'static str, total: u64) -> Self {
+        let terminal = io::stderr().is_terminal() && !QUIET.load(Ordering::Relaxed);
+        let bar = terminal.then(|| {
+            let template = "{prefix} [{bar:30}] {human_pos}/{human_len} {msg}";
+            let style = ProgressStyle::with_template(template)
+                .map_or_else(|_| ProgressStyle::default_bar(), |s| s.progress_chars("=> "));
+            let bar = BARS.add(ProgressBar::new(total).with_style(style).with_prefix(what));
+            bar.enable_steady_tick(Duration::from_millis(200));
+            bar
+        });
+        let now = Instant::now();
+        Self { bar, what, unit, total, started: now, last_line: now, from: None }
+    }
+
+    /// Sets the number of finished units. `extra` is shown behind rate and remaining time.
+    pub fn set(&mut self, done: u64, extra: &str) {
+        let from = *self.from.get_or_insert(done);
+        let (rate, left) = self.estimate(done - from.min(done), self.total.saturating_sub(done));
+        let mut text = self.unit.to_owned();
+        for part in [rate, left, extra.to_owned()] {
+            if !part.is_empty() {
+                text.push_str(", ");
+                text.push_str(&part);
+            }
+        }
+        if let Some(bar) = &self.bar {
+            bar.set_position(done);
+            bar.set_message(text);
+        } else if self.last_line.elapsed() >= PLAIN_EVERY {
+            self.last_line = Instant::now();
+            note(&format!("{} {}/{} {text}", self.what, thousands(done), thousands(self.total)));
+        }
+    }
+
+    /// Units a second since the start, and the time that is left at that rate.
+    fn estimate(&self, made: u64, open: u64) -> (String, String) {
+        let seconds = self.started.elapsed().as_secs_f64();
+        if made == 0 || seconds <= 0.0 {
+            return (String::new(), String::new());
+        }
+        let rate = made as f64 / seconds;
+        let left = format!("{} left", duration(open as f64 / rate));
+        (format!("{rate:.1}/s"), if open > 0 { left } else { String::new() })
+    }
+
+}
+
+/// The bar goes when its command is done with it, however that came.
+impl Drop for Progress {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// Where log lines go: stderr, above the bar.
+pub struct LogWriter;
+
+impl Write for LogWriter {
+    fn write(&mut self, line: &[u8]) -> io::Result<usize> {
+        BARS.suspend(|| io::stderr().write(line))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        io::stderr().flush()
+    }
+}

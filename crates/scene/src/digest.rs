@@ -1,0 +1,59 @@
+//! What a scene is made of, as hashes: two scenes with the same digest hold the same bytes.
+//!
+//! The digest covers the main file and every external buffer, in the order of `buffers`, each
+//! once. Images are left out: they do not change geometry. Buffers that are marked as the
+//! fallback of a compression extension count when their file is there.
+//!
+//! `combined` is the BLAKE3 hash over, for each file, the length of its name (8 bytes, little
+//! endian), its name, its size (8 bytes, little endian) and its BLAKE3 hash (32 bytes).
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{SceneError, gltf_reader};
+
+/// Hash of one file of a scene.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileDigest {
+    /// Path relative to the folder of the main file, `/` between its parts.
+    pub name: String,
+    /// Size in bytes.
+    pub size: u64,
+    /// BLAKE3 hash, 64 hexadecimal digits.
+    pub blake3: String,
+}
+
+/// Hashes of the files of a scene.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SceneDigest {
+    /// The files, the main file first.
+    pub files: Vec<FileDigest>,
+    /// BLAKE3 hash over the list, 64 hexadecimal digits.
+    pub combined: String,
+}
+
+impl SceneDigest {
+    pub(crate) fn of_files(files: Vec<(String, u64, blake3::Hash)>) -> Self {
+        let mut combined = blake3::Hasher::new();
+        for (name, size, hash) in &files {
+            combined.update(&(name.len() as u64).to_le_bytes());
+            combined.update(name.as_bytes());
+            combined.update(&size.to_le_bytes());
+            combined.update(hash.as_bytes());
+        }
+        let files = files
+            .into_iter()
+            .map(|(name, size, hash)| FileDigest { name, size, blake3: hash.to_hex().to_string() })
+            .collect();
+        Self { files, combined: combined.finalize().to_hex().to_string() }
+    }
+}
+
+/// Hashes a scene without reading its geometry; equal to the digest of [`crate::Scene::open`].
+///
+/// # Errors
+/// When the main file or an external buffer cannot be read or the JSON is invalid.
+pub fn digest(path: &Path) -> Result<SceneDigest, SceneError> {
+    gltf_reader::digest(path).map_err(|e| e.in_file(path))
+}

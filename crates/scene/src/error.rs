@@ -1,0 +1,541 @@
+//! Why a scene is refused, where in the file, and what to do about it.
+//!
+//! Promise: a file is either read or refused with one [`SceneError`]; the reader never panics
+//! and never allocates by a count that the file's bytes do not back. [`Cause`] has one variant a
+//! cause; [`SceneError::help`] says what the author of the file can do. Nobody needs to match on
+//! strings.
+
+use std::{
+    fmt, io,
+    path::{Path, PathBuf},
+};
+
+/// A scene that was refused.
+#[derive(Debug)]
+pub struct SceneError {
+    /// The main file of the scene.
+    pub file: PathBuf,
+    /// The part of the scene that was being read.
+    pub place: Place,
+    /// What is wrong.
+    pub cause: Box<Cause>,
+}
+
+/// The part of a scene that an error is about; glTF indices, as far as they are known.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Place {
+    /// Index into `nodes`.
+    pub node: Option<u32>,
+    /// Index into `meshes`.
+    pub mesh: Option<u32>,
+    /// Index into the mesh's `primitives`.
+    pub primitive: Option<u32>,
+}
+
+/// What is wrong with a scene. Byte ranges are half open.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Cause {
+    /// The main file cannot be read.
+    #[error("cannot read the file: {source}")]
+    Read {
+        /// The operating system's reason.
+        source: io::Error,
+    },
+    /// The path names a folder or a device.
+    #[error("not a regular file")]
+    NotAFile,
+    /// The pattern of a see-through rule does not parse.
+    #[error("the see-through pattern `{pattern}` is malformed: {reason}")]
+    Pattern {
+        /// The pattern as given.
+        pattern: String,
+        /// What the pattern parser says.
+        reason: String,
+    },
+
+    /// A GLB file ends before the length that it states.
+    #[error("the GLB container is cut short: {what} needs {needed} bytes, {available} are there")]
+    GlbTruncated {
+        /// Header, chunk header or chunk.
+        what: &'static str,
+        /// Bytes that it needs.
+        needed: u64,
+        /// Bytes that are left in the file.
+        available: u64,
+    },
+    /// A GLB file of another version.
+    #[error("GLB container version {version} instead of 2")]
+    GlbVersion {
+        /// The version in the header.
+        version: u32,
+    },
+    /// The first chunk of a GLB file is not JSON.
+    #[error("the first GLB chunk has type {found:#010x} instead of JSON")]
+    GlbWithoutJson {
+        /// Type of the first chunk.
+        found: u32,
+    },
+    /// The JSON does not parse, or a property has the wrong type.
+    #[error("the JSON is invalid at line {line}, column {column}: {reason}")]
+    Json {
+        /// Line, from 1.
+        line: usize,
+        /// Column, from 1.
+        column: usize,
+        /// What the JSON parser says.
+        reason: String,
+    },
+    /// Not a version of glTF that this reader knows.
+    #[error("glTF version `{version}` instead of 2.x")]
+    Version {
+        /// `asset.version` or `asset.minVersion`.
+        version: String,
+    },
+    /// The file requires an extension that changes geometry and is not known here.
+    #[error("the required extension `{extension}` is not supported")]
+    RequiredExtension {
+        /// Its name.
+        extension: String,
+    },
+    /// An extension's object does not have the form that its specification gives.
+    #[error("`{extension}` is malformed: {reason}")]
+    ExtensionMalformed {
+        /// Its name.
+        extension: &'static str,
+        /// What is wrong.
+        reason: String,
+    },
+    /// An index of the JSON names an element that does not exist.
+    #[error("{referrer} names {element} {index}, but there are {count}")]
+    NoSuch {
+        /// The property that holds the index.
+        referrer: String,
+        /// Kind of the missing element.
+        element: &'static str,
+        /// The index.
+        index: u64,
+        /// Number of elements of the kind.
+        count: u64,
+    },
+    /// A property has a value that glTF does not allow.
+    #[error("{property} has a value that glTF does not allow")]
+    InvalidValue {
+        /// The property.
+        property: String,
+    },
+
+    /// The URI of a buffer is refused.
+    #[error("buffer {buffer}: the URI `{uri}` {problem}")]
+    BufferUri {
+        /// Index into `buffers`.
+        buffer: u32,
+        /// The URI, shortened when long.
+        uri: String,
+        /// Why it is refused.
+        problem: UriProblem,
+    },
+    /// An external buffer cannot be read.
+    #[error("buffer {buffer}: cannot read `{}`: {source}", file.display())]
+    MissingBuffer {
+        /// Index into `buffers`.
+        buffer: u32,
+        /// The file that its URI names.
+        file: PathBuf,
+        /// The operating system's reason.
+        source: io::Error,
+    },
+    /// A buffer holds fewer bytes than it states.
+    #[error("buffer {buffer} states {stated} bytes, {available} are there")]
+    TruncatedBuffer {
+        /// Index into `buffers`.
+        buffer: u32,
+        /// `byteLength`.
+        stated: u64,
+        /// Bytes in the file, the data URI or the binary chunk.
+        available: u64,
+    },
+    /// A buffer with neither a URI nor a binary chunk is needed.
+    #[error("buffer {buffer} has no URI and the file has no binary chunk for it")]
+    BufferWithoutData {
+        /// Index into `buffers`.
+        buffer: u32,
+    },
+    /// A buffer view reaches behind its buffer.
+    #[error(
+        "buffer view {view} is bytes {start}..{end} of buffer {buffer}, which has {available} bytes"
+    )]
+    ViewOutOfBuffer {
+        /// Index into `bufferViews`.
+        view: u32,
+        /// Index into `buffers`.
+        buffer: u32,
+        /// First byte.
+        start: u64,
+        /// Byte behind the last.
+        end: u64,
+        /// Bytes in the buffer.
+        available: u64,
+    },
+    /// Compressed data does not decode.
+    #[error("buffer view {view}: `{extension}` data does not decode: {reason}")]
+    Compressed {
+        /// Index into `bufferViews`.
+        view: u32,
+        /// The compression extension.
+        extension: &'static str,
+        /// What is wrong.
+        reason: String,
+    },
+
+    /// An accessor reaches behind its buffer view.
+    #[error(
+        "accessor {accessor} ({part}) needs {needed} bytes of buffer view {view}, which has {available}"
+    )]
+    AccessorOutOfView {
+        /// Index into `accessors`.
+        accessor: u32,
+        /// Elements, sparse indices or sparse values.
+        part: &'static str,
+        /// Index into `bufferViews`.
+        view: u32,
+        /// Bytes from the start of the view to the end of the last element.
+        needed: u64,
+        /// Bytes in the view.
+        available: u64,
+    },
+    /// An accessor has the wrong type for its use.
+    #[error("accessor {accessor} holds {found} and cannot be used as {use_as}")]
+    AccessorType {
+        /// Index into `accessors`.
+        accessor: u32,
+        /// Type and component type.
+        found: String,
+        /// What it is used for.
+        use_as: &'static str,
+    },
+    /// The elements of an accessor overlap.
+    #[error(
+        "accessor {accessor}: the stride of {stride} bytes is less than an element's {element}"
+    )]
+    AccessorStride {
+        /// Index into `accessors`.
+        accessor: u32,
+        /// `byteStride`.
+        stride: u64,
+        /// Bytes in an element.
+        element: u64,
+    },
+    /// An accessor without data claims more elements than is allowed without data.
+    #[error("accessor {accessor} claims {count} elements without data; the limit is {limit}")]
+    AccessorTooLarge {
+        /// Index into `accessors`.
+        accessor: u32,
+        /// `count`.
+        count: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// A sparse accessor replaces an element that does not exist.
+    #[error("accessor {accessor}: sparse entry {entry} replaces element {index} of {count}")]
+    SparseIndex {
+        /// Index into `accessors`.
+        accessor: u32,
+        /// Number of the sparse entry.
+        entry: u64,
+        /// The index it holds.
+        index: u64,
+        /// Elements of the accessor.
+        count: u64,
+    },
+    /// Attributes that must have the same number of elements do not.
+    #[error("accessor {accessor} ({use_as}) has {count} elements instead of {expected}")]
+    CountMismatch {
+        /// Index into `accessors`.
+        accessor: u32,
+        /// What it is used for.
+        use_as: &'static str,
+        /// Its elements.
+        count: u64,
+        /// Elements of its companions.
+        expected: u64,
+    },
+
+    /// A vertex that a triangle uses is NaN or infinite.
+    #[error("vertex {vertex} is at {position:?}, which is not finite")]
+    PositionNotFinite {
+        /// Index of the vertex in the primitive.
+        vertex: u32,
+        /// Its position.
+        position: [f32; 3],
+    },
+    /// A vertex that a triangle uses is too far away.
+    #[error("vertex {vertex} is at {position:?}, farther than {limit:e} m")]
+    PositionTooFar {
+        /// Index of the vertex in the primitive.
+        vertex: u32,
+        /// Its position.
+        position: [f32; 3],
+        /// The limit, metres.
+        limit: f64,
+    },
+    /// A vertex index is out of range.
+    #[error("index {at} of the primitive is {index}, but there are {vertices} vertices")]
+    IndexOutOfRange {
+        /// Position in the index list.
+        at: u64,
+        /// The index.
+        index: u32,
+        /// Vertices of the primitive.
+        vertices: u64,
+    },
+    /// A vertex index is the primitive restart value, which glTF forbids.
+    #[error("index {at} of the primitive is {index}, the primitive restart value")]
+    PrimitiveRestart {
+        /// Position in the index list.
+        at: u64,
+        /// The index.
+        index: u32,
+    },
+    /// Draco data does not decode.
+    #[error("`KHR_draco_mesh_compression` data does not decode: {reason}")]
+    Draco {
+        /// What is wrong.
+        reason: String,
+    },
+
+    /// A node is its own ancestor.
+    #[error("node {node} is its own ancestor")]
+    NodeCycle {
+        /// Index into `nodes`.
+        node: u32,
+    },
+    /// A node is reached twice.
+    #[error("node {node} has two parents, or is listed twice")]
+    NodeWithTwoParents {
+        /// Index into `nodes`.
+        node: u32,
+    },
+    /// Nodes are nested too deeply.
+    #[error("nodes are nested more than {limit} deep")]
+    NodesTooDeep {
+        /// The limit.
+        limit: u32,
+    },
+    /// A transform is not finite.
+    #[error("the transform is not finite")]
+    TransformNotFinite,
+    /// A matrix whose last row is not 0 0 0 1.
+    #[error("the matrix is not affine: its last row is {row:?}")]
+    MatrixNotAffine {
+        /// The row.
+        row: [f64; 4],
+    },
+    /// A rotation of length zero.
+    #[error("the rotation has length zero")]
+    RotationZero,
+    /// Something lies too far from the world's origin.
+    #[error(
+        "the object reaches {coordinate:e} m from the world's origin; the limit is {limit:e} m"
+    )]
+    TooFar {
+        /// Largest coordinate.
+        coordinate: f64,
+        /// The limit.
+        limit: f64,
+    },
+
+    /// More triangles than primitive numbers.
+    #[error("the scene has {count} triangles with its instances; the limit is {limit}")]
+    TooManyTriangles {
+        /// Triangles, instances counted.
+        count: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// More triangles in memory than the options allow.
+    #[error("the scene has {count} unique triangles; the limit is {limit}")]
+    TooManyUniqueTriangles {
+        /// Triangles, each mesh counted once.
+        count: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// More instances than the options allow.
+    #[error("the scene has {count} instances; the limit is {limit}")]
+    TooManyInstances {
+        /// Instances.
+        count: u64,
+        /// The limit.
+        limit: u64,
+    },
+}
+
+/// Why a URI is refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum UriProblem {
+    /// It has a scheme such as `https:`.
+    Scheme,
+    /// It is an absolute path.
+    Absolute,
+    /// It leaves the folder of the main file.
+    Escape,
+    /// Its percent encoding is malformed, or not UTF-8.
+    Encoding,
+    /// It is a `data:` URI that does not decode.
+    Data,
+    /// It is empty.
+    Empty,
+}
+
+impl fmt::Display for UriProblem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Scheme => "has a scheme; only relative files and data: URIs are read",
+            Self::Absolute => "is an absolute path; only relative files are read",
+            Self::Escape => "leaves the folder of the scene",
+            Self::Encoding => "is not valid percent-encoded UTF-8",
+            Self::Data => "is not a valid data: URI",
+            Self::Empty => "is empty",
+        })
+    }
+}
+
+impl fmt::Display for Place {
+    /// `node 3, mesh 2, primitive 0: `, or nothing.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let parts = [("node", self.node), ("mesh", self.mesh), ("primitive", self.primitive)];
+        let known: Vec<String> =
+            parts.iter().filter_map(|(name, index)| index.map(|i| format!("{name} {i}"))).collect();
+        if known.is_empty() { Ok(()) } else { write!(f, "{}: ", known.join(", ")) }
+    }
+}
+
+impl fmt::Display for SceneError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}{}", self.file.display(), self.place, self.cause)
+    }
+}
+
+impl std::error::Error for SceneError {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        std::error::Error::source(&*self.cause)
+    }
+}
+
+impl From<Cause> for SceneError {
+    fn from(cause: Cause) -> Self {
+        Self { file: PathBuf::new(), place: Place::default(), cause: Box::new(cause) }
+    }
+}
+
+impl SceneError {
+    pub(crate) fn in_file(mut self, file: &Path) -> Self {
+        self.file = file.to_path_buf();
+        self
+    }
+
+    pub(crate) fn at_node(mut self, node: usize) -> Self {
+        self.place.node.get_or_insert(node as u32);
+        self
+    }
+
+    pub(crate) fn at_primitive(mut self, mesh: usize, primitive: usize) -> Self {
+        self.place.mesh.get_or_insert(mesh as u32);
+        self.place.primitive.get_or_insert(primitive as u32);
+        self
+    }
+
+    /// What to do about it, in one or two sentences; `None` when the message says it all.
+    #[must_use]
+    pub fn help(&self) -> Option<String> {
+        let text = match &*self.cause {
+            Cause::Read { .. } | Cause::NotAFile => {
+                "give the path of a .gltf or .glb file that this user can read".into()
+            }
+            Cause::Pattern { .. } => {
+                "patterns are globs: `*` and `**` match any text, `?` one character, `{a,b}` \
+                 alternatives; write `[*]` for a literal star"
+                    .into()
+            }
+            Cause::GlbTruncated { .. } | Cause::TruncatedBuffer { .. } => {
+                "the file was probably cut short while it was copied or downloaded; fetch or \
+                 export it again"
+                    .into()
+            }
+            Cause::GlbVersion { .. } | Cause::Version { .. } => {
+                "convert the file to glTF 2.0, for example by importing it in Blender and \
+                 exporting it again"
+                    .into()
+            }
+            Cause::GlbWithoutJson { .. } | Cause::Json { .. } => {
+                "this is not a valid glTF file; check that the path names the scene and not one \
+                 of its buffers, and export it again"
+                    .into()
+            }
+            Cause::RequiredExtension { extension } => format!(
+                "export the scene without `{extension}`; without it the triangles would be wrong"
+            ),
+            Cause::MissingBuffer { file, .. } => format!(
+                "put `{}` beside the scene, or pack everything into one file with `npx \
+                 @gltf-transform/cli copy scene.gltf scene.glb`",
+                file.display()
+            ),
+            Cause::BufferUri { .. } => {
+                "buffers have to lie in the folder of the scene or below; pack everything into \
+                 one file with `npx @gltf-transform/cli copy scene.gltf scene.glb`"
+                    .into()
+            }
+            Cause::Draco { .. } | Cause::Compressed { .. } => {
+                "decompress the scene with `npx @gltf-transform/cli copy in.glb out.glb`, which \
+                 removes KHR_draco_mesh_compression and EXT_meshopt_compression"
+                    .into()
+            }
+            Cause::PrimitiveRestart { .. } => {
+                "glTF has no primitive restart; export the strips as separate primitives or as \
+                 triangles"
+                    .into()
+            }
+            Cause::PositionNotFinite { .. } => {
+                "remove the vertex, or the modifier that made it, and export the scene again".into()
+            }
+            Cause::PositionTooFar { .. } | Cause::TooFar { .. } => {
+                "move the scene to the world's origin; its unit is the metre".into()
+            }
+            Cause::TransformNotFinite | Cause::MatrixNotAffine { .. } | Cause::RotationZero => {
+                "give the node a valid transform: finite numbers, a rotation of length 1".into()
+            }
+            Cause::NodeCycle { .. } | Cause::NodeWithTwoParents { .. } => {
+                "the nodes of a glTF scene form trees; use one node a placement, which may share \
+                 a mesh"
+                    .into()
+            }
+            Cause::NodesTooDeep { .. } => "flatten the node hierarchy".into(),
+            Cause::TooManyTriangles { .. } => {
+                "primitive numbers have 32 bits; split the world into several scenes".into()
+            }
+            Cause::TooManyUniqueTriangles { .. } | Cause::TooManyInstances { .. } => {
+                "raise the limit if this machine has the memory, or split the world into \
+                 several scenes"
+                    .into()
+            }
+            Cause::ExtensionMalformed { .. }
+            | Cause::NoSuch { .. }
+            | Cause::InvalidValue { .. }
+            | Cause::BufferWithoutData { .. }
+            | Cause::ViewOutOfBuffer { .. }
+            | Cause::AccessorOutOfView { .. }
+            | Cause::AccessorType { .. }
+            | Cause::AccessorStride { .. }
+            | Cause::AccessorTooLarge { .. }
+            | Cause::SparseIndex { .. }
+            | Cause::CountMismatch { .. }
+            | Cause::IndexOutOfRange { .. } => {
+                "the file breaks the glTF specification; report it to the maker of the exporter, \
+                 with the report of the Khronos glTF validator"
+                    .into()
+            }
+        };
+        Some(text)
+    }
+}

@@ -1,0 +1,74 @@
+//! Reading glTF 2.0: from bytes to a numbered [`Scene`].
+//!
+//! Source: Khronos, "glTF 2.0 Specification"; the extensions KHR_mesh_quantization,
+//! EXT_mesh_gpu_instancing, EXT_ and KHR_meshopt_compression, KHR_draco_mesh_compression,
+//! KHR_node_visibility.
+//!
+//! The steps, one module each:
+//! 1. `container`: a `.glb` file into its JSON and binary chunks;
+//! 2. `document`: the JSON into the types of the `gltf` crate, without what triangles do not
+//!    need, so that a broken animation or texture refuses nothing;
+//! 3. `uri`, `buffers`: external, embedded and data-URI buffers; views, decompressed by
+//!    `meshopt_view` where they are compressed;
+//! 4. `nodes`, `gpu_instancing`: the default scene into placements in `f64`;
+//! 5. `accessors`, `draco`, `primitives`: triangles of each unique primitive, in parallel;
+//! 6. `assemble`: numbering, objects, report.
+//!
+//! The `gltf` crate's own accessor iterators and validation are not used: they panic on ranges
+//! that are out of bounds. Every count is checked against the bytes behind it before memory is
+//! reserved; what has no bytes behind it has a limit of its own.
+
+mod accessors;
+mod assemble;
+mod buffers;
+mod container;
+mod document;
+mod draco;
+mod gpu_instancing;
+mod meshopt_view;
+mod nodes;
+mod primitives;
+mod uri;
+
+use std::path::Path;
+
+use crate::{Cause, OpenOptions, Scene, SceneDigest, SceneError};
+
+/// Largest coordinate of a used vertex and of anything in the world, metres (a tenth of a light
+/// year). Keeps areas and volumes of boxes finite in `f32` hierarchies.
+pub const MAX_COORDINATE: f64 = 1e15;
+
+/// Reads and numbers a scene.
+pub fn read(path: &Path, options: &OpenOptions) -> Result<Scene, SceneError> {
+    read_bytes(path, &read_main_file(path)?, options)
+}
+
+/// Reads and numbers a scene whose main file is in memory.
+pub fn read_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Scene, SceneError> {
+    let see_through = assemble::see_through_patterns(options)?;
+    let parts = container::split(main)?;
+    let document = document::Document::parse(parts.json)?;
+    document.check_extensions()?;
+    let buffers = buffers::Buffers::load(path, main, parts.binary, &document)?;
+    let accessors = accessors::Accessors::new(&document, &buffers);
+    let placed = nodes::placements(&document, &accessors, options)?;
+    let unique = primitives::collect(&document, &accessors, &placed, options)?;
+    assemble::scene(&document, &buffers, placed, unique, &see_through)
+}
+
+/// Hashes the files of a scene.
+pub fn digest(path: &Path) -> Result<SceneDigest, SceneError> {
+    let main = read_main_file(path)?;
+    let parts = container::split(&main)?;
+    let document = document::Document::parse(parts.json)?;
+    Ok(buffers::Buffers::load(path, &main, parts.binary, &document)?.digest())
+}
+
+fn read_main_file(path: &Path) -> Result<Vec<u8>, SceneError> {
+    let read = |source| SceneError::from(Cause::Read { source });
+    // Opening a named pipe would wait for a writer.
+    if !std::fs::metadata(path).map_err(read)?.is_file() {
+        return Err(Cause::NotAFile.into());
+    }
+    std::fs::read(path).map_err(read)
+}

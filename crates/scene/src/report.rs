@@ -1,0 +1,75 @@
+//! What reading a scene found: counts, what was left out, and what deserves a look.
+
+use serde::Serialize;
+
+/// Degenerate triangles that are listed for one glTF primitive; the count is complete.
+pub(crate) const LISTED_DEGENERATE_TRIANGLES: usize = 64;
+
+/// Degenerate triangles of one glTF primitive.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct DegenerateTriangles {
+    /// Index into the `meshes` of the file.
+    pub mesh: u32,
+    /// Index into the mesh's `primitives`.
+    pub primitive: u32,
+    /// How many there are.
+    pub count: u64,
+    /// Their triangle numbers in the glTF primitive, ascending; at most the first 64.
+    pub triangles: Vec<u32>,
+}
+
+/// glTF primitives that hold no triangles. Each is counted once however often it is placed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct SkippedPrimitives {
+    /// Primitives of mode POINTS.
+    pub points: u64,
+    /// Primitives of mode LINES, LINE_LOOP or LINE_STRIP.
+    pub lines: u64,
+    /// Triangle primitives without positions.
+    pub without_positions: u64,
+}
+
+/// What reading a scene found.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct IngestReport {
+    /// The tool that wrote the file, as it states.
+    pub generator: Option<String>,
+    /// The copyright notice in the file.
+    pub copyright: Option<String>,
+    /// Triangles in memory, without degenerate ones.
+    pub unique_triangles: u64,
+    /// Triangles with every instance counted: the number of primitives.
+    pub instanced_triangles: u64,
+    /// Vertices in memory: those that a triangle uses.
+    pub unique_vertices: u64,
+    /// Objects: nodes with at least one triangle.
+    pub objects: u64,
+    /// Bodies of triangles in memory.
+    pub meshes: u64,
+    /// Placements of them.
+    pub instances: u64,
+    /// Instanced triangles that hide nothing.
+    pub see_through_triangles: u64,
+    /// Triangles of zero area that were dropped, in all meshes in memory.
+    pub degenerate_triangles: u64,
+    /// Where they are, by glTF mesh and primitive.
+    pub degenerate: Vec<DegenerateTriangles>,
+    /// Primitives that hold no triangles.
+    pub skipped: SkippedPrimitives,
+    /// Nodes with a mesh that are switched off by KHR_node_visibility, or lie below such a node.
+    pub hidden_nodes: u64,
+    /// True when the file animates anything; the scene is read at rest.
+    pub animated: bool,
+    /// Number of animations in the file.
+    pub animations: u64,
+    /// Objects with a skin; they are read in the pose that the file stores.
+    pub skinned_objects: u64,
+    /// Instances that a scale of zero flattens; their triangles were flattened one by one.
+    pub flattened_instances: u64,
+    /// Extensions that the file uses, as it states.
+    pub used_extensions: Vec<String>,
+    /// Those of them that were ignored: they do not change triangles.
+    pub ignored_extensions: Vec<String>,
+    /// What deserves a look, one sentence each.
+    pub warnings: Vec<String>,
+}

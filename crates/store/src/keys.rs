@@ -1,0 +1,99 @@
+//! Where everything lies in a dataset folder. The one place that spells keys.
+//!
+//! ```text
+//! current.json                      pointer
+//! manifests/00000001.json           immutable, numbered
+//! data/<kind>-<hash>.parquet        immutable, named by content
+//! bake/<bake>/plan.bin              the plan
+//! bake/<bake>/epochs/00000001       coordinator epochs
+//! bake/<bake>/parts/<task>-<attempt>[-cells|-objects].parquet
+//! bake/<bake>/commits/<task>        finished tasks
+//! bake/probe/                       scratch of the start-up probe
+//! ```
+
+/// The pointer to the current manifest.
+pub const POINTER: &str = "current.json";
+/// Folder of the manifests.
+pub const MANIFEST_FOLDER: &str = "manifests";
+/// Folder of the bakes' state.
+pub const BAKE_FOLDER: &str = "bake";
+/// Scratch of the start-up probe.
+pub const PROBE_FOLDER: &str = "bake/probe";
+
+/// What a part file holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PartKind {
+    /// Visible sets of segments.
+    Segments,
+    /// Rows of cells.
+    Cells,
+    /// Rows of (cell, object).
+    Objects,
+}
+
+/// Key of a manifest.
+#[must_use]
+pub fn manifest(number: u64) -> String {
+    format!("{MANIFEST_FOLDER}/{number:08}.json")
+}
+
+/// The number in a manifest's key.
+#[must_use]
+pub fn manifest_number(key: &str) -> Option<u64> {
+    let digits = key.strip_prefix(MANIFEST_FOLDER)?.strip_prefix('/')?.strip_suffix(".json")?;
+    digits.parse().ok()
+}
+
+/// Key of a bake's plan.
+#[must_use]
+pub fn plan(bake: &str) -> String {
+    format!("{BAKE_FOLDER}/{bake}/plan.bin")
+}
+
+/// Folder of a bake's coordinator epochs.
+#[must_use]
+pub fn epochs(bake: &str) -> String {
+    format!("{BAKE_FOLDER}/{bake}/epochs")
+}
+
+/// Key of a coordinator epoch.
+#[must_use]
+pub fn epoch(bake: &str, number: u64) -> String {
+    format!("{BAKE_FOLDER}/{bake}/epochs/{number:08}")
+}
+
+/// Folder of a bake's part files.
+#[must_use]
+pub fn parts(bake: &str) -> String {
+    format!("{BAKE_FOLDER}/{bake}/parts")
+}
+
+/// Key of a part file. `attempt` names the attempt and must suit a file name.
+#[must_use]
+pub fn part(bake: &str, task: u32, attempt: &str, kind: PartKind) -> String {
+    let suffix = match kind {
+        PartKind::Segments => "",
+        PartKind::Cells => "-cells",
+        PartKind::Objects => "-objects",
+    };
+    format!("{BAKE_FOLDER}/{bake}/parts/{task:08}-{attempt}{suffix}.parquet")
+}
+
+/// Folder of a bake's commits.
+#[must_use]
+pub fn commits(bake: &str) -> String {
+    format!("{BAKE_FOLDER}/{bake}/commits")
+}
+
+/// Key of a task's commit.
+#[must_use]
+pub fn commit(bake: &str, task: u32) -> String {
+    format!("{BAKE_FOLDER}/{bake}/commits/{task:08}")
+}
+
+/// The task number in a commit's key.
+#[must_use]
+pub fn commit_task(key: &str) -> Option<u32> {
+    let (folder, task) = key.rsplit_once('/')?;
+    if folder.ends_with("/commits") { task.parse().ok() } else { None }
+}

@@ -1,0 +1,216 @@
+//! The rows that writers take and readers give. Plain data; the tables are in [`crate::tables`].
+
+use sightline_geometry::{
+    Bounds, CellId, MeshId, ObjectId, PrimitiveId, PrimitiveSet, SegmentId, ViewCell,
+};
+
+/// What one view segment sees.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SegmentRow {
+    /// The segment's number in the plan.
+    pub segment: SegmentId,
+    /// The visible primitives.
+    pub set: PrimitiveSet,
+    /// One weight a member, in ascending order of the members: the share of (solid angle x
+    /// segment) on which the member is nearest, in [0, 1].
+    pub weights: Vec<f32>,
+}
+
+/// What one view cell sees, and how well that was established.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CellRow {
+    /// The cell.
+    pub cell: ViewCell,
+    /// Tile of the view region, (x, z).
+    pub tile: [i32; 2],
+    /// The visible primitives.
+    pub set: PrimitiveSet,
+    /// Segments that were solved for the cell.
+    pub segments: u32,
+    /// Refinement rounds that were run.
+    pub refinements: u32,
+    /// Rays cast from held-out viewpoints to measure the error.
+    pub heldout_rays: u64,
+    /// Mean pixel error over the held-out viewpoints, share of pixels.
+    pub heldout_error_mean: f64,
+    /// Pixel error of the worst held-out viewpoint, share of pixels.
+    pub heldout_error_max: f64,
+}
+
+/// How much of one object a cell sees.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ObjectRow {
+    /// The cell.
+    pub cell: CellId,
+    /// The object, of which at least one primitive is visible.
+    pub object: ObjectId,
+    /// Visible primitives of the object.
+    pub visible_primitives: u32,
+    /// All primitives of the object.
+    pub total_primitives: u32,
+    /// Share of (solid angle x segments) on which a primitive of the object is nearest, in [0, 1].
+    pub weight: f64,
+    /// First state in which the object is visible; 0 in static scenes.
+    pub first_state: u32,
+    /// Last state in which the object is visible; 0 in static scenes.
+    pub last_state: u32,
+}
+
+/// An object of the scene. Objects are numbered from 0 in the order of their primitives.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneObject {
+    /// The object's number.
+    pub id: ObjectId,
+    /// The name its author gave it; may be empty, need not be unique.
+    pub name: String,
+    /// Names from the root of the scene to the object, joined by `/`.
+    pub path: String,
+    /// Number of its glTF node.
+    pub node: u32,
+    /// First primitive.
+    pub first_primitive: u32,
+    /// First primitive behind the object.
+    pub end_primitive: u32,
+    /// True when the object hides what is behind it; false for see-through objects.
+    pub occluder: bool,
+    /// World box, metres.
+    pub bounds: Bounds,
+}
+
+/// An instance of a mesh: a run of primitive numbers. Together with [`NumberedMesh`] it leads from
+/// a primitive number to a triangle of the glTF file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct NumberedInstance {
+    /// Global number of its first triangle.
+    pub first_primitive: u32,
+    /// The object it belongs to.
+    pub object: ObjectId,
+    /// Number of its glTF node.
+    pub node: u32,
+    /// Number within the node's `EXT_mesh_gpu_instancing`, where the node has it.
+    pub gpu_instance: Option<u32>,
+    /// The mesh whose triangles it repeats.
+    pub mesh: MeshId,
+}
+
+/// A body of triangles: one glTF primitive, its triangles in Sightline's order.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NumberedMesh {
+    /// The mesh's number.
+    pub id: MeshId,
+    /// Number of the glTF mesh.
+    pub gltf_mesh: u32,
+    /// Number of the primitive within the glTF mesh.
+    pub gltf_primitive: u32,
+    /// For each triangle in Sightline's order, its number in the glTF primitive.
+    pub triangles: Vec<u32>,
+}
+
+/// From primitive numbers to the triangles of the glTF file.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Numbering {
+    /// Instances, ascending by first primitive, without gaps.
+    pub instances: Vec<NumberedInstance>,
+    /// Meshes, by number from 0.
+    pub meshes: Vec<NumberedMesh>,
+}
+
+/// Where a triangle is found in the glTF file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct GltfTriangle {
+    /// The instance, with its node.
+    pub instance: NumberedInstance,
+    /// Number of the glTF mesh.
+    pub gltf_mesh: u32,
+    /// Number of the primitive within the glTF mesh.
+    pub gltf_primitive: u32,
+    /// Number of the triangle within the glTF primitive.
+    pub triangle: u32,
+}
+
+impl Numbering {
+    /// The glTF triangle of a global primitive number; `None` behind the last primitive.
+    #[must_use]
+    pub fn locate(&self, primitive: PrimitiveId) -> Option<GltfTriangle> {
+        let after = self.instances.partition_point(|i| i.first_primitive <= primitive.0);
+        let instance = *self.instances.get(after.checked_sub(1)?)?;
+        let mesh = self.meshes.get(instance.mesh.index())?;
+        let in_mesh = (primitive.0 - instance.first_primitive) as usize;
+        Some(GltfTriangle {
+            instance,
+            gltf_mesh: mesh.gltf_mesh,
+            gltf_primitive: mesh.gltf_primitive,
+            triangle: *mesh.triangles.get(in_mesh)?,
+        })
+    }
+
+    /// Checks the numbering against the number of primitives of the scene.
+    ///
+    /// # Errors
+    /// The broken rule.
+    pub fn check(&self, primitives: u64) -> Result<(), String> {
+        if let Some((k, mesh)) =
+            self.meshes.iter().enumerate().find(|(k, mesh)| mesh.id.index() != *k)
+        {
+            return Err(format!("mesh {} stands at place {k}", mesh.id));
+        }
+        let mut next = 0_u64;
+        for instance in &self.instances {
+            let Some(mesh) = self.meshes.get(instance.mesh.index()) else {
+                return Err(format!("there is no mesh {}", instance.mesh));
+            };
+            if u64::from(instance.first_primitive) != next {
+                let first = instance.first_primitive;
+                return Err(format!("an instance starts at primitive {first} instead of {next}"));
+            }
+            next += mesh.triangles.len() as u64;
+        }
+        if next != primitives {
+            return Err(format!("instances hold {next} primitives and objects {primitives}"));
+        }
+        Ok(())
+    }
+}
+
+/// What the index says of a cell: everything but its set, and where that is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CellEntry {
+    /// The cell.
+    pub cell: ViewCell,
+    /// Tile of the view region, (x, z).
+    pub tile: [i32; 2],
+    /// Number of visible primitives.
+    pub primitives: u32,
+    /// Where the cell's row lies.
+    pub set: SetLocation,
+    /// Where the cell's (cell, object) rows lie.
+    pub objects: ObjectsLocation,
+}
+
+/// Where a cell's row, and the page with its set, lie.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SetLocation {
+    /// Key of the cells file.
+    pub file: String,
+    /// Row group in the file.
+    pub row_group: u32,
+    /// Row in the row group.
+    pub row: u32,
+    /// Offset in the file of the data page that holds the set, bytes.
+    pub page_offset: u32,
+    /// Size of that page with its header, bytes.
+    pub page_bytes: u32,
+    /// Place of the set among the values of that page.
+    pub page_row: u32,
+}
+
+/// Where a cell's (cell, object) rows lie.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ObjectsLocation {
+    /// Key of the objects file.
+    pub file: String,
+    /// First row in the file.
+    pub first_row: u32,
+    /// Number of rows.
+    pub rows: u32,
+}

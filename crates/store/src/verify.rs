@@ -1,0 +1,248 @@
+//! Checking a dataset: every checksum, every rule of the format.
+//!
+//! Problems are collected, each with the file it lies in, so that one run shows all damage. Only a
+//! store that does not answer ends a check early.
+
+use futures::TryStreamExt;
+use sightline_geometry::CellId;
+
+use crate::manifest::{DataFile, FileKind, hash};
+use crate::publish::current;
+use crate::reader::verified;
+use crate::rows::{CellEntry, CellRow, ObjectRow, SceneObject};
+use crate::tables::{CELLS, INDEX, INSTANCES, MESHES, OBJECTS, SCENE, Table, count};
+use crate::tables::{cell_rows, object_rows};
+use crate::writer::{check_cell, check_objects, check_pairs};
+use crate::{BakeStore, Dataset, Result, StoreError, keys};
+
+/// What is wrong with a file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    /// Key of the file.
+    pub file: String,
+    /// What is wrong with it.
+    pub problem: String,
+}
+
+/// What a check found.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct CheckReport {
+    /// Files that were read, pointer and manifest included.
+    pub files: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Cells whose sets and rows were compared.
+    pub cells: u64,
+    /// What is wrong, in the order it was found.
+    pub problems: Vec<Problem>,
+}
+
+impl CheckReport {
+    /// True when nothing is wrong.
+    #[must_use]
+    pub fn is_sound(&self) -> bool {
+        self.problems.is_empty()
+    }
+
+    /// Notes damage; hands on errors of other classes.
+    fn note<T>(&mut self, result: Result<T>) -> Result<Option<T>> {
+        match result {
+            Ok(value) => Ok(Some(value)),
+            Err(StoreError::Corrupt { file, problem }) => {
+                self.problems.push(Problem { file, problem });
+                Ok(None)
+            }
+            Err(error @ StoreError::UnsupportedVersion { .. }) => {
+                let StoreError::UnsupportedVersion { file, .. } = &error else { unreachable!() };
+                self.problems.push(Problem { file: file.clone(), problem: error.to_string() });
+                Ok(None)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    fn broken(&mut self, file: &str, problem: impl Into<String>) {
+        self.problems.push(Problem { file: file.into(), problem: problem.into() });
+    }
+}
+
+impl Dataset {
+    /// Checks the current dataset in `store` from the pointer on: every file's size and hash, then
+    /// every rule of the format. Reads everything.
+    ///
+    /// # Errors
+    /// [`StoreError::NotADataset`], or what the store reports. Damage is no error, but in the
+    /// report.
+    pub async fn check(store: &BakeStore) -> Result<CheckReport> {
+        let mut report = CheckReport::default();
+        let found = current(store).await;
+        let Some(found) = report.note(found)? else { return Ok(report) };
+        if let Some((pointer, manifest)) = &found {
+            report.files = 2;
+            report.bytes = store.size(keys::POINTER).await? + manifest.to_bytes().len() as u64;
+            let sum = manifest.files.iter().map(|f| f.bytes).sum::<u64>();
+            if sum != manifest.totals.file_bytes {
+                let name = keys::manifest(pointer.manifest);
+                report.broken(&name, "its files' sizes do not add up to its total");
+            }
+            for file in &manifest.files {
+                check_file(store, file, &mut report).await?;
+            }
+        }
+        if report.is_sound() {
+            let opened = Self::open(store).await;
+            if let Some(dataset) = report.note(opened)? {
+                let checked = dataset.check_rules(&mut report).await;
+                report.note(checked)?;
+            }
+        }
+        Ok(report)
+    }
+
+    async fn check_rules(&self, report: &mut CheckReport) -> Result<()> {
+        let manifest_name = keys::manifest(self.number());
+        let objects = self.objects().await?;
+        let primitives = match check_objects(&objects) {
+            Ok(primitives) => primitives,
+            Err(problem) => {
+                report.broken(first_file(self, FileKind::Scene), problem);
+                return Ok(());
+            }
+        };
+        let scene = &self.manifest().scene;
+        if (scene.triangles, scene.objects) != (primitives, objects.len() as u64) {
+            report.broken(&manifest_name, "it counts other triangles or objects than the scene");
+        }
+        if let Err(problem) = self.numbering().await?.check(primitives) {
+            report.broken(first_file(self, FileKind::Numbering), problem);
+        }
+        self.check_cells(&objects, primitives, report).await?;
+        let totals = self.manifest().totals;
+        let listed: u64 = self.cells().iter().map(|e| u64::from(e.primitives)).sum();
+        let pairs: u64 = self.cells().iter().map(|e| u64::from(e.objects.rows)).sum();
+        if (totals.primitives, totals.object_rows) != (listed, pairs) {
+            report.broken(&manifest_name, "its totals differ from the sums over the cells");
+        }
+        Ok(())
+    }
+
+    /// Walks cells, index rows and (cell, object) rows side by side.
+    async fn check_cells(
+        &self,
+        objects: &[SceneObject],
+        primitives: u64,
+        report: &mut CheckReport,
+    ) -> Result<()> {
+        let mut entries = self.cells().iter();
+        let mut pairs = std::pin::pin!(self.all_object_rows());
+        let mut next_pair = pairs.try_next().await?;
+        let mut cells = std::pin::pin!(self.cell_rows());
+        while let Some(row) = cells.try_next().await? {
+            let Some(entry) = entries.next() else {
+                report.broken(first_file(self, FileKind::Index), "cells are missing in it");
+                return Ok(());
+            };
+            let mut own = Vec::new();
+            while let Some(pair) = next_pair.filter(|pair| pair.cell <= row.cell.id) {
+                own.push(pair);
+                next_pair = pairs.try_next().await?;
+            }
+            check_row(&row, entry, &own, objects, primitives, report);
+            report.cells += 1;
+        }
+        if entries.next().is_some() || next_pair.is_some() {
+            report
+                .broken(first_file(self, FileKind::Cells), "cells of the index are missing in it");
+        }
+        Ok(())
+    }
+}
+
+fn check_row(
+    row: &CellRow,
+    entry: &CellEntry,
+    pairs: &[ObjectRow],
+    objects: &[SceneObject],
+    primitives: u64,
+    report: &mut CheckReport,
+) {
+    if let Err(problem) = check_cell(row, primitives) {
+        report.broken(&entry.set.file, problem);
+    }
+    if let Err(problem) = check_pairs(row, pairs, objects) {
+        report.broken(&entry.objects.file, problem);
+    }
+    let agrees = entry.cell == row.cell
+        && entry.tile == row.tile
+        && entry.primitives == count(&row.set)
+        && entry.objects.rows as usize == pairs.len();
+    if !agrees {
+        let problem = format!("the index and the row of cell {} differ", row.cell.id);
+        report.broken(&entry.set.file, problem);
+    }
+}
+
+/// Checks one file by itself: size, hash, format, columns, number of rows, range of cells.
+async fn check_file(store: &BakeStore, file: &DataFile, report: &mut CheckReport) -> Result<()> {
+    report.files += 1;
+    report.bytes += file.bytes;
+    if !file.name.ends_with(&format!("-{}.parquet", &file.blake3.get(..32).unwrap_or_default())) {
+        report.broken(&file.name, "its name is not that of its content");
+    }
+    let bytes = verified(store, file).await;
+    let Some(bytes) = report.note(bytes)? else { return Ok(()) };
+    let footer = bytes.len().saturating_sub(file.footer_bytes as usize);
+    if hash(&bytes[footer..]) != file.footer_blake3 {
+        report.broken(&file.name, "the hash of its footer is not the one in the manifest");
+    }
+    let counted = count_rows(file, bytes);
+    let Some((rows, cells)) = report.note(counted)? else { return Ok(()) };
+    if rows != file.rows {
+        report.broken(&file.name, format!("it has {rows} rows instead of {}", file.rows));
+    }
+    let listed = file.first_cell.zip(file.last_cell);
+    if let (Some((first, last)), Some((listed_first, listed_last))) = (cells, listed)
+        && (first.0 < listed_first || last.0 > listed_last)
+    {
+        report.broken(&file.name, "it holds cells that the manifest lays elsewhere");
+    }
+    Ok(())
+}
+
+/// The number of rows of a file, and its first and last cell where it holds cells.
+fn count_rows(file: &DataFile, bytes: bytes::Bytes) -> Result<(u64, Option<(CellId, CellId)>)> {
+    let mut rows = 0;
+    let mut ends: Option<(CellId, CellId)> = None;
+    for batch in table(file.kind).decode(&file.name, bytes)? {
+        let batch = batch?;
+        rows += batch.num_rows() as u64;
+        let ids: Vec<CellId> = match file.kind {
+            FileKind::Cells => {
+                cell_rows(&file.name, &batch)?.iter().map(|row| row.cell.id).collect()
+            }
+            FileKind::Objects => {
+                object_rows(&file.name, &batch)?.iter().map(|row| row.cell).collect()
+            }
+            _ => Vec::new(),
+        };
+        if let (Some(&first), Some(&last)) = (ids.first(), ids.last()) {
+            ends = Some((ends.map_or(first, |(first, _)| first), last));
+        }
+    }
+    Ok((rows, ends))
+}
+
+fn table(kind: FileKind) -> &'static Table {
+    match kind {
+        FileKind::Cells => &CELLS,
+        FileKind::Objects => &OBJECTS,
+        FileKind::Index => &INDEX,
+        FileKind::Scene => &SCENE,
+        FileKind::Numbering => &INSTANCES,
+        FileKind::Meshes => &MESHES,
+    }
+}
+
+fn first_file(dataset: &Dataset, kind: FileKind) -> &str {
+    dataset.manifest().files_of(kind).next().map_or(keys::POINTER, |file| file.name.as_str())
+}

@@ -1,0 +1,196 @@
+//! A small made-up dataset, the same everywhere: tests compare its bytes, and the golden files in
+//! `schemas/golden/` are written from it.
+
+#![allow(dead_code)]
+
+pub mod faulty;
+
+use std::collections::BTreeMap;
+
+use glam::DVec3;
+use serde_json::json;
+use sightline_geometry::{
+    Bounds, CellId, MeshId, ObjectId, PrimitiveSet, Run, SegmentId, ViewCell,
+};
+use sightline_store::{
+    BakeStore, CellRow, DatasetWriter, Description, Limits, Manifest, NumberedInstance,
+    NumberedMesh, Numbering, ObjectRow, SceneFile, SceneObject, SceneSource, SegmentRow,
+};
+
+/// Numbers that look random and are the same on every machine (Knuth's MMIX constants).
+pub struct Sequence(u64);
+
+impl Sequence {
+    pub fn new(seed: u64) -> Self {
+        Self(seed)
+    }
+
+    /// The next number below `bound`.
+    pub fn below(&mut self, bound: u32) -> u32 {
+        self.0 = self.0.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        ((self.0 >> 33) as u32) % bound
+    }
+}
+
+/// Rows of a made-up bake.
+pub struct Sample {
+    pub objects: Vec<SceneObject>,
+    pub numbering: Numbering,
+    pub cells: Vec<(CellRow, Vec<ObjectRow>)>,
+    pub description: Description,
+}
+
+const MESH_SIZES: [u32; 3] = [12, 40, 250];
+const NAMES: [&str; 4] = ["house", "tree", "fence", "lamp \u{2014} small"];
+
+impl Sample {
+    /// `cells` cells that see a scene of `object_count` objects.
+    pub fn new(cells: u32, object_count: u32) -> Self {
+        let mut random = Sequence::new(7);
+        let (objects, numbering) = scene(object_count, &mut random);
+        let cells = (0..cells).map(|id| cell(id, &objects, &mut random)).collect();
+        Self { objects, numbering, cells, description: description() }
+    }
+
+    /// The sample of the golden files.
+    pub fn golden() -> Self {
+        Self::new(24, 60)
+    }
+
+    /// Stores all files; gives the manifest.
+    pub async fn write(&self, store: &BakeStore, limits: Limits) -> Manifest {
+        self.try_write(store, limits).await.unwrap()
+    }
+
+    pub async fn try_write(
+        &self,
+        store: &BakeStore,
+        limits: Limits,
+    ) -> sightline_store::Result<Manifest> {
+        let mut writer = DatasetWriter::with_limits(store, self.objects.clone(), limits)?;
+        for (cell, pairs) in &self.cells {
+            writer.push_cell(cell, pairs).await?;
+        }
+        writer.finish(&self.numbering, self.description.clone()).await
+    }
+}
+
+fn scene(count: u32, random: &mut Sequence) -> (Vec<SceneObject>, Numbering) {
+    let mut objects = Vec::new();
+    let mut instances = Vec::new();
+    let mut next = 0;
+    for id in 0..count {
+        let mesh = random.below(MESH_SIZES.len() as u32);
+        let name = NAMES[random.below(NAMES.len() as u32) as usize];
+        let first = next;
+        // Every fifth object repeats its mesh three times.
+        for copy in 0..if id % 5 == 4 { 3 } else { 1 } {
+            instances.push(NumberedInstance {
+                first_primitive: next,
+                object: ObjectId(id),
+                node: id + 1,
+                gpu_instance: (id % 5 == 4).then_some(copy),
+                mesh: MeshId(mesh),
+            });
+            next += MESH_SIZES[mesh as usize];
+        }
+        let min = DVec3::new(f64::from(random.below(400)) * 0.25, 0.0, f64::from(id) * 1.5);
+        objects.push(SceneObject {
+            id: ObjectId(id),
+            name: name.into(),
+            path: format!("town/block {}/{name}", id / 8),
+            node: id + 1,
+            first_primitive: first,
+            end_primitive: next,
+            occluder: !name.starts_with("fence"),
+            bounds: Bounds { min, max: min + DVec3::new(2.0, 3.5, 2.0) },
+        });
+    }
+    let meshes = MESH_SIZES.iter().enumerate().map(|(id, &size)| NumberedMesh {
+        id: MeshId(id as u32),
+        gltf_mesh: id as u32 / 2,
+        gltf_primitive: id as u32 % 2,
+        triangles: (0..size).map(|k| (k * 7 + 3) % size).collect(),
+    });
+    let meshes = meshes.collect();
+    (objects, Numbering { instances, meshes })
+}
+
+fn cell(id: u32, objects: &[SceneObject], random: &mut Sequence) -> (CellRow, Vec<ObjectRow>) {
+    let mut set = PrimitiveSet::default();
+    let mut pairs = Vec::new();
+    for object in objects {
+        // Cell 5 sees nothing; the others see about two objects of three.
+        if id == 5 || random.below(3) == 0 {
+            continue;
+        }
+        let total = object.end_primitive - object.first_primitive;
+        let first = object.first_primitive + random.below(total);
+        let end = first + 1 + random.below(object.end_primitive - first);
+        set.push(Run { first, end });
+        pairs.push(ObjectRow {
+            cell: CellId(id),
+            object: object.id,
+            visible_primitives: end - first,
+            total_primitives: total,
+            weight: f64::from(random.below(1 << 20)) / f64::from(1 << 24),
+            first_state: 0,
+            last_state: 0,
+        });
+    }
+    let tile = [(id % 6) as i32 - 2, (id / 6) as i32];
+    let corner = |dx: i32, dz: i32| {
+        let (x, z) = (f64::from(tile[0] + dx) * 10.0, f64::from(tile[1] + dz) * 10.0);
+        DVec3::new(x, 1.5 + 0.125 * x, z)
+    };
+    let row = CellRow {
+        cell: ViewCell {
+            id: CellId(id),
+            corners: [corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)],
+            height: 0.25,
+        },
+        tile,
+        set,
+        segments: 8,
+        refinements: id % 3,
+        heldout_rays: 64_000,
+        heldout_error_mean: f64::from(random.below(1000)) / f64::from(1 << 22),
+        heldout_error_max: f64::from(random.below(1000)) / f64::from(1 << 20),
+    };
+    (row, pairs)
+}
+
+fn description() -> Description {
+    Description {
+        scene: SceneSource {
+            uri: "town.gltf".into(),
+            hash: "00c0ffee".into(),
+            files: vec![SceneFile {
+                name: "town.bin".into(),
+                bytes: 12_345,
+                blake3: "00".repeat(32),
+            }],
+            ..SceneSource::default()
+        },
+        config: json!({ "solver": { "rows": 200, "rings": 2 }, "region": { "cell_size": 10.0 } }),
+        config_hash: "0badcafe".into(),
+        skipped: BTreeMap::from([("inside a solid".into(), 3), ("no ground".into(), 1)]),
+    }
+}
+
+/// Rows of a made-up segments task.
+pub fn segments(count: u32) -> Vec<SegmentRow> {
+    let mut random = Sequence::new(11);
+    let row = |id: u32| {
+        let mut set = PrimitiveSet::default();
+        let mut first = random.below(50);
+        for _ in 0..random.below(40) {
+            let end = first + 1 + random.below(30);
+            set.push(Run { first, end });
+            first = end + 1 + random.below(100);
+        }
+        let weights = (0..set.len()).map(|_| random.below(1 << 20) as f32 / 1e9).collect();
+        SegmentRow { segment: SegmentId(3 * id), set, weights }
+    };
+    (0..count).map(row).collect()
+}

@@ -1,0 +1,404 @@
+//! What Sightline promises to who runs it, kept by the real commands on a small city.
+
+use std::net::{Ipv4Addr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use serde_json::Value;
+use sightline_geometry::CellId;
+use sightline_proto::v1::GetStatusRequest;
+use sightline_proto::v1::coordinator_client::CoordinatorClient;
+use sightline_store::{BakeStore, CellEntry, Dataset};
+use sightline_tests::binaries::{executable, sightline};
+use sightline_tests::city::{self, City, LIMIT};
+use sightline_tests::process::{self, Process, eventually};
+use sightline_tests::{dataset, requirement};
+use tonic::transport::Endpoint;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+use tonic_reflection::pb::v1::ServerReflectionRequest;
+use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
+use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
+use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
+
+/// Mean pixel error that a dataset may have, share of pixels: 0.02 %.
+const MEAN_MAX: f64 = 0.0002;
+/// Error of the worst viewpoint that a dataset may have, share of pixels: 0.5 %.
+const WORST_MAX: f64 = 0.005;
+
+fn folder() -> PathBuf {
+    Path::new(env!("CARGO_TARGET_TMPDIR")).join("end_to_end")
+}
+
+/// The city that all tests share, baked once.
+fn baked() -> &'static City {
+    static CITY: OnceLock<City> = OnceLock::new();
+    CITY.get_or_init(|| City::bake(&folder()))
+}
+
+/// An empty folder of one test.
+fn empty(name: &str) -> PathBuf {
+    let folder = baked().folder.join(name);
+    std::fs::create_dir(&folder).expect("a folder can be made once");
+    folder
+}
+
+fn run(command: &mut Command) -> process::Ended {
+    process::run(command, LIMIT)
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("{value} is a number"))
+}
+
+/// A port of this machine that nobody listens on.
+fn free_port() -> u16 {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a port is free");
+    listener.local_addr().expect("it has an address").port()
+}
+
+fn is_listening(port: u16) -> bool {
+    std::net::TcpStream::connect((Ipv4Addr::LOCALHOST, port)).is_ok()
+}
+
+/// The commands of one cluster.
+struct Cluster {
+    folder: PathBuf,
+    dataset: PathBuf,
+    url: String,
+    coordinator: Process,
+}
+
+impl Cluster {
+    /// Starts a coordinator; `command` listens on the port that it is given.
+    fn start(name: &str, command: impl FnOnce(&Path, &str) -> Command) -> Self {
+        let folder = empty(name);
+        let dataset = folder.join("dataset");
+        let port = free_port();
+        let mut command = command(&dataset, &format!("127.0.0.1:{port}"));
+        let mut coordinator = Process::start(&mut command, &folder, "coordinator");
+        let listening = eventually(LIMIT, || is_listening(port) || !coordinator.is_running());
+        assert!(listening && coordinator.is_running(), "{}", coordinator.stderr());
+        Self { folder, dataset, url: format!("http://127.0.0.1:{port}"), coordinator }
+    }
+
+    /// `sightline coordinator`. Its tasks are cut otherwise than those of the shared bake: the
+    /// dataset must not depend on it.
+    fn of_sightline(name: &str) -> Self {
+        Self::start(name, |dataset, listen| {
+            let mut command = sightline(city::bake_arguments("coordinator", &baked().scene, dataset));
+            command.args(["--segments-per-task=3", "--cells-per-task=1", "--listen", listen]);
+            command
+        })
+    }
+
+    fn worker(&self, name: &str) -> Process {
+        let mut command = sightline(["worker", "--threads=1", "--coordinator", &self.url]);
+        Process::start(&mut command, &self.folder, name)
+    }
+}
+
+#[test]
+fn bake_says_what_it_did() {
+    let city = baked();
+    let cells = number(&city.summary["cells"]);
+    assert_eq!(cells, entries(city).len() as f64, "{:#}", city.summary);
+    assert_eq!(cells, 16.0, "the street is free, so no cell is skipped");
+}
+
+#[test]
+fn the_same_command_gives_the_same_bytes_with_one_thread() {
+    let out = empty("again");
+    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out));
+    let _ = run(command.args(["--threads=1", "--json"])).success();
+    dataset::assert_same(&baked().dataset, &out);
+}
+
+#[test]
+fn cluster_with_a_killed_worker_writes_the_bytes_of_bake() {
+    let cluster = Cluster::of_sightline("cluster");
+    let victim = cluster.worker("victim");
+    let others = [cluster.worker("worker-1"), cluster.worker("worker-2")];
+    let some_done = || dataset::commits(&cluster.dataset) >= 3;
+    assert!(eventually(LIMIT, some_done), "no task was finished:\n{}", victim.stderr());
+    victim.kill();
+    assert!(!cluster.dataset.join("current.json").exists(), "the worker died half-way");
+    let _ = cluster.coordinator.wait(LIMIT).success();
+    for worker in others {
+        let _ = worker.wait(LIMIT).success();
+    }
+    dataset::assert_same(&baked().dataset, &cluster.dataset);
+}
+
+#[test]
+fn a_worker_that_joins_late_helps_and_one_that_leaves_is_not_missed() {
+    let cluster = Cluster::of_sightline("joining");
+    let mut first = cluster.worker("first");
+    assert!(eventually(LIMIT, || dataset::commits(&cluster.dataset) >= 2), "{}", first.stderr());
+    let late = cluster.worker("late");
+    first.interrupt();
+    let _ = first.wait(LIMIT);
+    let _ = cluster.coordinator.wait(LIMIT).success();
+    let _ = late.wait(LIMIT).success();
+    dataset::assert_same(&baked().dataset, &cluster.dataset);
+}
+
+#[test]
+fn a_killed_coordinator_is_replaced_by_another() {
+    let cluster = Cluster::of_sightline("replaced");
+    let worker = cluster.worker("worker");
+    assert!(eventually(LIMIT, || dataset::commits(&cluster.dataset) >= 3), "{}", worker.stderr());
+    let Cluster { folder, dataset, url, coordinator } = cluster;
+    coordinator.kill();
+    let before = dataset::commits(&dataset);
+    let listen = url.trim_start_matches("http://");
+    let mut command = sightline(city::bake_arguments("coordinator", &baked().scene, &dataset));
+    command.args(["--segments-per-task=3", "--cells-per-task=1", "--listen", listen]);
+    let successor = Process::start(&mut command, &folder, "successor");
+    let _ = successor.wait(LIMIT).success();
+    let _ = worker.wait(LIMIT).success();
+    assert!(dataset::commits(&dataset) > before);
+    dataset::assert_same(&baked().dataset, &dataset);
+}
+
+#[test]
+fn thin_binaries_write_the_bytes_of_bake() {
+    let config = baked().folder.join("bake.toml");
+    let text = "\
+        [region]\nrectangles = [[-5.0, -20.0, 5.0, 20.0]]\ncell_size = 5.0\n\
+        [solver]\nrows = 100\n\
+        [accuracy]\nheldout_viewpoints = 8\nheldout_rays = 2000\ntarget_error = 0.0001\n\
+        worst_error = 0.001\nrounds = 3\n";
+    std::fs::write(&config, text).expect("the configuration can be written");
+    let cluster = Cluster::start("thin", |dataset, listen| {
+        let mut command = Command::new(executable("sightline-coordinator"));
+        command.arg(&baked().scene).arg("--out").arg(dataset).arg("--config").arg(&config);
+        command.args(["--set", "tasks.segments_per_task=5", "--listen", listen]);
+        command
+    });
+    let mut command = Command::new(executable("sightline-worker"));
+    command.arg(&cluster.url).args(["--threads", "2", "--name", "thin"]);
+    let worker = Process::start(&mut command, &cluster.folder, "worker");
+    let _ = cluster.coordinator.wait(LIMIT).success();
+    let _ = worker.wait(LIMIT).success();
+    dataset::assert_same(&baked().dataset, &cluster.dataset);
+}
+
+#[test]
+fn an_interrupted_bake_resumes_to_the_same_bytes() {
+    let folder = empty("interrupted");
+    let out = folder.join("dataset");
+    let command = || {
+        let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out));
+        command.args(["--threads=1", "--json"]);
+        command
+    };
+    let mut bake = Process::start(&mut command(), &folder, "first");
+    assert!(eventually(LIMIT, || dataset::commits(&out) >= 3), "{}", bake.stderr());
+    bake.interrupt();
+    let ended = bake.wait(LIMIT).failure(130);
+    assert!(ended.stderr.contains("resume"), "{}", ended.stderr);
+    assert!(!out.join("current.json").exists(), "nothing is published half-way");
+    let before = dataset::commits(&out);
+    assert!(before >= 3);
+    let _ = run(&mut command()).success();
+    assert!(dataset::commits(&out) > before, "the first half was kept");
+    dataset::assert_same(&baked().dataset, &out);
+}
+
+#[test]
+fn a_changed_input_is_named() {
+    let folder = empty("changed");
+    let (scene, out) = (folder.join("scene.glb"), folder.join("dataset"));
+    let one_cell = || {
+        let mut command = sightline(["bake"]);
+        command.arg(&scene).arg("--out").arg(&out);
+        command.args(["--region=0,0,5,5", "--cell-size=5", "--rounds=0"]);
+        command
+    };
+    city::generate(&scene, 1);
+    let _ = run(one_cell().arg("--rows=16")).success();
+    let other_key = run(one_cell().arg("--rows=20"));
+    assert!(other_key.stderr.contains("solver.rows changed from 16 to 20"), "{other_key:#?}");
+    city::generate(&scene, 2);
+    let other_scene = run(one_cell().arg("--rows=20"));
+    assert!(other_scene.stderr.contains("scene file `scene.glb` changed"), "{other_scene:#?}");
+}
+
+#[test]
+fn an_unknown_key_is_refused_with_a_suggestion() {
+    let folder = empty("unknown-key");
+    let config = folder.join("bake.toml");
+    std::fs::write(&config, "[solver]\nrow = 100\n").expect("a file can be written");
+    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &folder.join("out")));
+    let ended = run(command.arg("--config").arg(&config)).failure(2);
+    assert!(ended.stderr.contains("solver.row`"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("did you mean `solver.rows`"), "{}", ended.stderr);
+}
+
+#[test]
+fn verify_finds_the_error_small() {
+    let found = verify(&[]).success().json();
+    let (mean, worst) = (number(&found["error_mean"]), number(&found["error_max"]));
+    assert!(mean <= MEAN_MAX && worst <= WORST_MAX, "{found:#}");
+    assert_eq!(number(&found["viewpoints"]), 4.0 * entries(baked()).len() as f64);
+}
+
+#[test]
+fn verify_fails_over_a_limit() {
+    let ended = verify(&["--max-mean=-1"]).failure(1);
+    assert!(ended.stderr.contains("mean pixel error"), "{}", ended.stderr);
+}
+
+#[test]
+fn the_worst_viewpoint_command_reproduces_its_figure() {
+    // The sparsest possible rays and a seed of its own, so that the worst is not always the same.
+    let worst = verify(&["--seed=3"]).success().json()["worst"].clone();
+    let command = worst["command"].as_str().expect("the command is a text");
+    let folder = executable("sightline").parent().expect("it is in a folder");
+    let path = std::env::var("PATH").unwrap_or_default();
+    let mut shell = Command::new("sh");
+    shell.args(["-c", &format!("{command} --json")]);
+    shell.env("PATH", format!("{}:{path}", folder.display()));
+    let again = run(&mut shell).success().json()["worst"].clone();
+    for figure in ["cell", "viewpoint", "rays", "wrong", "error"] {
+        assert_eq!(worst[figure], again[figure], "{figure} of {command}");
+    }
+}
+
+fn verify(more: &[&str]) -> process::Ended {
+    let mut command = sightline(["verify", "--viewpoints=4", "--rays=20000", "--json"]);
+    run(command.args(more).arg(&baked().dataset))
+}
+
+#[test]
+fn cell_at_a_position_contains_it() {
+    for entry in entries(baked()) {
+        let at = entry.cell.center();
+        let found = cell_at(at.x, at.y, at.z).success().json();
+        assert_eq!(found["cell"], entry.cell.id.0, "{at}");
+    }
+    let nowhere = cell_at(1e6, 0.0, 0.0).failure(1);
+    assert!(nowhere.stderr.contains("nearest"), "{}", nowhere.stderr);
+}
+
+fn cell_at(x: f64, y: f64, z: f64) -> process::Ended {
+    let mut command = sightline(["cell", "--json"]);
+    run(command.arg(format!("--at={x},{y},{z}")).arg(&baked().dataset))
+}
+
+/// The cells of the dataset, by the reader of the library.
+fn entries(city: &City) -> Vec<CellEntry> {
+    let store = BakeStore::open(&city.dataset.display().to_string()).expect("the store opens");
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime starts");
+    let dataset = runtime.block_on(Dataset::open(&store)).expect("the dataset opens");
+    dataset.cells().to_vec()
+}
+
+fn export(cell: CellId, name: &str) -> PathBuf {
+    let out = empty(name).join("cell.glb");
+    let mut command = sightline(["export", "--cell", &cell.to_string(), "-o"]);
+    let _ = run(command.arg(&out).arg(&baked().dataset)).success();
+    out
+}
+
+fn info(path: &Path, more: &[&str]) -> Value {
+    run(sightline(["info", "--json"]).args(more).arg(path)).success().json()
+}
+
+#[test]
+fn exported_cell_has_the_triangles_of_its_set() {
+    let cell = CellId(3);
+    let out = export(cell, "exported");
+    let visible = info(&baked().dataset, &["--cell", &cell.to_string()]);
+    let exported = info(&out, &[]);
+    let visible = number(&visible["visible_primitives"]);
+    assert_eq!(visible, number(&exported["report"]["instanced_triangles"]), "{exported:#}");
+}
+
+#[test]
+fn exported_cell_passes_the_khronos_validator() {
+    let test = "exported_cell_passes_the_khronos_validator";
+    let found = requirement::node_with_validator();
+    let install = "Node.js and `npm ci` in tests/gltf-validator";
+    let Some(node) = requirement::program(test, found, install) else { return };
+    let out = export(CellId(5), "validated");
+    let script = sightline_tests::workspace::root().join("tests/gltf-validator/validate.mjs");
+    let ended = run(Command::new(node).arg(script).arg(&out));
+    assert!(ended.status.success(), "{ended:#?}");
+}
+
+#[test]
+fn duckdb_answers_the_two_questions() {
+    let test = "duckdb_answers_the_two_questions";
+    let install = "`.venv` with the packages of tests/analytics/requirements.txt";
+    let found = requirement::python_with_duckdb();
+    let Some(python) = requirement::program(test, found, install) else { return };
+    let script = sightline_tests::workspace::root().join("tests/analytics/query_dataset.py");
+    let answers = run(Command::new(python).arg(script).arg(&baked().dataset)).success().json();
+    assert_eq!(answers["cells"], 16);
+    let objects = answers["top_objects"].as_array().expect("a list of objects");
+    assert_eq!(objects.len(), 10, "the ten objects seen from most cells");
+    let histogram = answers["set_size_histogram"].as_array().expect("a histogram");
+    let counted: u64 = histogram.iter().filter_map(|row| row["cells"].as_u64()).sum();
+    assert_eq!(counted, 16, "every cell is in one class: {answers:#}");
+}
+
+#[test]
+fn info_describes_scene_dataset_and_cell() {
+    let scene = info(&baked().scene, &[]);
+    let triangles = number(&scene["report"]["instanced_triangles"]);
+    assert!((29_000.0..31_000.0).contains(&triangles), "{triangles}");
+    let dataset = info(&baked().dataset, &[]);
+    assert_eq!(number(&dataset["summary"]["cells"]), 16.0, "{dataset:#}");
+    let missing = run(sightline(["info", "--cell=99"]).arg(&baked().dataset)).failure(3);
+    assert!(missing.stderr.contains("cell 99"), "{}", missing.stderr);
+}
+
+#[test]
+fn health_and_reflection_answer() {
+    let cluster = Cluster::of_sightline("health");
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime starts");
+    let asked = runtime.block_on(async {
+        tokio::time::timeout(Duration::from_secs(30), ask(cluster.url.clone())).await
+    });
+    asked.expect("the coordinator answers in time").expect("the coordinator answers");
+}
+
+async fn ask(url: String) -> Result<(), Box<dyn std::error::Error>> {
+    let coordinator = "sightline.v1.Coordinator";
+    let channel = Endpoint::from_shared(url)?.connect().await?;
+    let mut health = HealthClient::new(channel.clone());
+    for service in ["", coordinator] {
+        let answer = health.check(HealthCheckRequest { service: service.into() }).await?;
+        assert_eq!(answer.into_inner().status(), ServingStatus::Serving, "`{service}`");
+    }
+    let request = ServerReflectionRequest {
+        host: String::new(),
+        message_request: Some(MessageRequest::ListServices(String::new())),
+    };
+    let mut reflection = ServerReflectionClient::new(channel.clone());
+    let mut answers =
+        reflection.server_reflection_info(tokio_stream::once(request)).await?.into_inner();
+    let answer = answers.message().await?.and_then(|m| m.message_response);
+    let Some(MessageResponse::ListServicesResponse(list)) = answer else {
+        panic!("no list of services: {answer:?}")
+    };
+    let names: Vec<&str> = list.service.iter().map(|s| s.name.as_str()).collect();
+    assert!(names.contains(&coordinator), "{names:?}");
+    let status = CoordinatorClient::new(channel).get_status(GetStatusRequest {}).await?;
+    let status = status.into_inner();
+    assert_eq!(status.cells.map(|c| c.total), Some(16), "{status:?}");
+    Ok(())
+}
+
+#[test]
+fn demo_ends_with_where_to_look_next() {
+    let out = empty("demo").join("demo");
+    let mut command = sightline(["demo", "--triangles=30k", "--out"]);
+    let ended = run(command.arg(&out)).success();
+    assert!(ended.stdout.contains("sightline export"), "{}", ended.stdout);
+}

@@ -1,0 +1,194 @@
+//! Real scenes, baked and verified: few cells and few rows, so that it takes seconds each.
+//!
+//! The scenes are not in the repository; see [`sightline_tests::scenes`].
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Mutex;
+use std::time::Duration;
+
+use glam::DVec3;
+use serde_json::Value;
+use sightline_geometry::CellId;
+use sightline_scene::{OpenOptions, Scene};
+use sightline_store::{BakeStore, CellRow, Dataset};
+use sightline_tests::binaries::sightline;
+use sightline_tests::{process, scenes};
+
+/// Longest time for one command.
+const LIMIT: Duration = Duration::from_secs(600);
+/// Mean pixel error that a dataset may have, share of pixels: 0.02 %.
+const MEAN_MAX: f64 = 0.0002;
+/// Error of the worst viewpoint that a dataset may have, share of pixels: 0.5 %.
+const WORST_MAX: f64 = 0.005;
+
+const LINZ: &str = "city/linz_center_r700m_with_ground.glb";
+const ROTTERDAM: &str = "city/rotterdam_center_r900m.glb";
+const HOSPITAL: &str = "indoor/hospital_three_floors.glb";
+const HOSPITAL_INSTANCED: &str = "indoor/hospital_three_floors_gpuinst.glb";
+const QUAKE: &str = "indoor/lq_e1m1.glb";
+
+/// Rooms and a corridor on the lowest floor, below its ceiling.
+const WARD: [&str; 5] =
+    ["--region=-6,-2,2,6", "--cell-size=2", "--heights=absolute", "--eye-height=1.5,1.8", "--rows=100"];
+
+/// Bakes are large; one at a time keeps memory and time predictable.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
+fn alone<R>(work: impl FnOnce() -> R) -> R {
+    // A test that failed has released whatever it held.
+    let _turn = ONE_AT_A_TIME.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    work()
+}
+
+/// Bakes a scene into an empty folder. Returns the folder and what the bake said.
+fn bake(name: &str, scene: &Path, flags: &[&str]) -> (PathBuf, Value) {
+    let out = Path::new(env!("CARGO_TARGET_TMPDIR")).join("scenes").join(name);
+    // Left over from the last run of the tests, or not there.
+    let _ = std::fs::remove_dir_all(&out);
+    let mut command = sightline(["bake", "--json", "--out"]);
+    let ended = process::run(command.arg(&out).args(flags).arg(scene), LIMIT).success();
+    (out, ended.json())
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("{value} is a number"))
+}
+
+/// Bakes and verifies; there have to be `cells` cells at least.
+fn keeps_its_promise(test: &str, scene: &str, cells: f64, flags: &[&str]) {
+    let Some(scene) = scenes::shared(test, scene) else { return };
+    alone(|| {
+        let (out, summary) = bake(test, &scene, flags);
+        assert!(number(&summary["cells"]) >= cells, "too few cells: {summary:#}");
+        let mut verify: Command = sightline(["verify", "--viewpoints=2", "--rays=20000", "--json"]);
+        let found = process::run(verify.arg(&out), LIMIT).success().json();
+        let (mean, worst) = (number(&found["error_mean"]), number(&found["error_max"]));
+        assert!(mean <= MEAN_MAX && worst <= WORST_MAX, "{found:#}");
+    });
+}
+
+#[test]
+fn a_street_of_linz_keeps_its_promise() {
+    let flags = ["--region=-40,-40,0,0", "--rows=100", "--ground=ground_derived*"];
+    keeps_its_promise("a_street_of_linz_keeps_its_promise", LINZ, 8.0, &flags);
+}
+
+#[test]
+fn rotterdam_without_ground_keeps_its_promise() {
+    let flags = ["--region=-40,-40,0,0", "--rows=100", "--heights=absolute"];
+    keeps_its_promise("rotterdam_without_ground_keeps_its_promise", ROTTERDAM, 8.0, &flags);
+}
+
+#[test]
+fn a_hospital_ward_keeps_its_promise() {
+    keeps_its_promise("a_hospital_ward_keeps_its_promise", HOSPITAL, 8.0, &WARD);
+}
+
+#[test]
+fn a_game_level_keeps_its_promise() {
+    let flags = ["--region=0,-10,10,0", "--cell-size=2.5", "--ground-from=6", "--rows=100"];
+    keeps_its_promise("a_game_level_keeps_its_promise", QUAKE, 4.0, &flags);
+}
+
+/// A scene and the rows of its dataset.
+struct Baked {
+    scene: Scene,
+    rows: Vec<CellRow>,
+}
+
+impl Baked {
+    fn open(scene: &Path, dataset: &Path) -> Self {
+        let scene = Scene::open(scene, &OpenOptions::default()).expect("the scene opens");
+        let runtime = tokio::runtime::Runtime::new().expect("a runtime starts");
+        let rows = runtime.block_on(async {
+            let store = BakeStore::open(&dataset.display().to_string()).expect("the store opens");
+            let dataset = Dataset::open(&store).await.expect("the dataset opens");
+            let mut rows = Vec::new();
+            for entry in dataset.cells() {
+                rows.push(dataset.cell(entry.cell.id).await.expect("a cell can be read"));
+            }
+            rows
+        });
+        Self { scene, rows }
+    }
+
+    /// World-space corners of the visible triangles of a cell, in an order that does not depend
+    /// on the numbering.
+    fn visible(&self, cell: CellId) -> Vec<[DVec3; 3]> {
+        let row = self.rows.iter().find(|r| r.cell.id == cell).expect("the cell is there");
+        let sorted = |mut corners: [DVec3; 3]| {
+            corners.sort_by(|a, b| a.to_array().map(tenth_millimetres).cmp(&b.to_array().map(tenth_millimetres)));
+            corners
+        };
+        row.set.iter().map(|p| sorted(self.scene.geometry.triangle(p).corners)).collect()
+    }
+}
+
+fn tenth_millimetres(metres: f64) -> i64 {
+    (metres * 1e4).round() as i64
+}
+
+type Key = [[i64; 3]; 3];
+
+fn key(triangle: &[DVec3; 3]) -> Key {
+    triangle.map(|p| p.to_array().map(tenth_millimetres))
+}
+
+/// Triangles of `a` without a partner in `b`: the same triangle up to rounding at 10^-4 m.
+fn without_partner(a: &[[DVec3; 3]], b: &[[DVec3; 3]]) -> Vec<[DVec3; 3]> {
+    let mut partners: BTreeMap<Key, u32> = BTreeMap::new();
+    for triangle in b {
+        *partners.entry(key(triangle)).or_default() += 1;
+    }
+    let mut left = Vec::new();
+    for triangle in a {
+        match partners.get_mut(&key(triangle)) {
+            Some(count) if *count > 0 => *count -= 1,
+            _ => left.push(*triangle),
+        }
+    }
+    // What sits on a rounding border: look at the corners themselves.
+    let is_close = |p: &[DVec3; 3], q: &[DVec3; 3]| {
+        p.iter().all(|x| q.iter().any(|y| (*x - *y).abs().max_element() <= 1e-4))
+    };
+    left.retain(|p| !b.iter().any(|q| is_close(p, q)));
+    left
+}
+
+#[test]
+fn hospital_and_its_gpu_instanced_twin_see_the_same_triangles() {
+    let test = "hospital_and_its_gpu_instanced_twin_see_the_same_triangles";
+    let (Some(plain), Some(twin)) =
+        (scenes::shared(test, HOSPITAL), scenes::shared(test, HOSPITAL_INSTANCED))
+    else {
+        return;
+    };
+    let (a, b) = alone(|| {
+        let (a, _) = bake("hospital", &plain, &WARD);
+        let (b, _) = bake("hospital-gpuinst", &twin, &WARD);
+        (Baked::open(&plain, &a), Baked::open(&twin, &b))
+    });
+    let boxes = |x: &Baked| x.rows.iter().map(|r| r.cell.clone()).collect::<Vec<_>>();
+    assert_eq!(boxes(&a), boxes(&b), "the same cells");
+    let mut differences = Vec::new();
+    for row in &a.rows {
+        let (x, y) = (a.visible(row.cell.id), b.visible(row.cell.id));
+        let (only_plain, only_twin) = (without_partner(&x, &y), without_partner(&y, &x));
+        if !only_plain.is_empty() || !only_twin.is_empty() {
+            differences.push(format!(
+                "cell {}: {} and {} visible; {} only in the plain scene, {} only in its twin: {:?} {:?}",
+                row.cell.id,
+                x.len(),
+                y.len(),
+                only_plain.len(),
+                only_twin.len(),
+                only_plain.first(),
+                only_twin.first(),
+            ));
+        }
+    }
+    let cells = a.rows.len();
+    assert!(differences.is_empty(), "{} of {cells} cells differ: {differences:#?}", differences.len());
+}

@@ -1,0 +1,209 @@
+//! Talking to the coordinator: registering, and doing so again when it changed.
+//!
+//! A call that fails because the coordinator is gone or busy is tried again for a while, with
+//! growing pauses. A coordinator that does not know this worker, or is of another epoch, is
+//! registered with again; one of an epoch older than the newest this worker has seen is refused,
+//! and asked again until it is replaced or the time is up.
+
+use std::time::{Duration, Instant};
+
+use sightline_jobs::FORMAT_VERSION;
+use sightline_proto::v1::coordinator_client::CoordinatorClient;
+use sightline_proto::{MESSAGE_BYTES_MAX, v1};
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status};
+
+use crate::WorkerError;
+
+/// Longest a connection may take, and a call: a lease request waits for a second at most.
+const CONNECT_TIME: Duration = Duration::from_secs(5);
+const CALL_TIME: Duration = Duration::from_secs(20);
+/// First and longest pause between two tries.
+const PAUSE_MIN: Duration = Duration::from_millis(50);
+const PAUSE_MAX: Duration = Duration::from_secs(2);
+
+/// A client of the coordinator.
+pub(crate) type Client = CoordinatorClient<Channel>;
+
+/// A registration with one coordinator.
+#[derive(Clone, Debug)]
+pub(crate) struct Session {
+    pub worker: u32,
+    pub epoch: u64,
+    pub bake_id: String,
+    pub store_location: String,
+    pub scene_uri: String,
+    pub scene_digest: String,
+    pub heartbeat: Duration,
+}
+
+/// What a failed call asks for.
+#[derive(Debug)]
+pub(crate) enum CallError {
+    /// The coordinator does not know us, or is another one.
+    RegisterAgain,
+    /// It does not answer; it may later.
+    TryAgain(String),
+    /// It does not want this.
+    Refused(String),
+}
+
+impl From<Status> for CallError {
+    fn from(status: Status) -> Self {
+        match status.code() {
+            Code::FailedPrecondition | Code::NotFound => Self::RegisterAgain,
+            Code::InvalidArgument
+            | Code::Unimplemented
+            | Code::PermissionDenied
+            | Code::Unauthenticated
+            | Code::DataLoss
+            | Code::OutOfRange => Self::Refused(status.message().to_owned()),
+            _ => Self::TryAgain(status.message().to_owned()),
+        }
+    }
+}
+
+/// A way to the coordinator.
+pub(crate) struct Connection {
+    url: String,
+    name: String,
+    threads: u32,
+    patience: Duration,
+    pub client: Client,
+    /// The bake, and its newest epoch that this worker has seen.
+    newest: Option<(String, u64)>,
+}
+
+/// Growing pauses until the patience is over.
+struct Pauses {
+    start: Instant,
+    pause: Duration,
+}
+
+impl Pauses {
+    fn new() -> Self {
+        Self { start: Instant::now(), pause: PAUSE_MIN }
+    }
+
+    /// Waits; false when the time is up.
+    async fn wait(&mut self, patience: Duration) -> bool {
+        if self.start.elapsed() >= patience {
+            return false;
+        }
+        tokio::time::sleep(self.pause).await;
+        self.pause = (self.pause * 2).min(PAUSE_MAX);
+        true
+    }
+}
+
+impl Connection {
+    /// Does not connect yet.
+    pub fn new(
+        url: &str,
+        name: &str,
+        threads: usize,
+        patience: Duration,
+    ) -> Result<Self, WorkerError> {
+        let bad = |problem: String| WorkerError::BadUrl { url: url.to_owned(), problem };
+        let endpoint = Endpoint::from_shared(url.to_owned())
+            .map_err(|error| bad(error.to_string()))?
+            .connect_timeout(CONNECT_TIME)
+            .timeout(CALL_TIME);
+        if endpoint.uri().scheme_str() != Some("http") {
+            return Err(bad("it does not start with http://".into()));
+        }
+        let client = CoordinatorClient::new(endpoint.connect_lazy())
+            .max_decoding_message_size(MESSAGE_BYTES_MAX)
+            .max_encoding_message_size(MESSAGE_BYTES_MAX);
+        Ok(Self {
+            url: url.to_owned(),
+            name: name.to_owned(),
+            threads: u32::try_from(threads).unwrap_or(u32::MAX),
+            patience,
+            client,
+            newest: None,
+        })
+    }
+
+    /// Registers, trying for as long as the patience lasts.
+    pub async fn register(&mut self) -> Result<Session, WorkerError> {
+        let mut pauses = Pauses::new();
+        loop {
+            let problem = match self.try_register().await {
+                Ok(session) => return Ok(session),
+                Err(CallError::Refused(reason)) => return Err(WorkerError::Refused(reason)),
+                Err(CallError::RegisterAgain) => "it is of an older epoch".to_owned(),
+                Err(CallError::TryAgain(problem)) => problem,
+            };
+            tracing::info!(url = self.url, problem, "the coordinator does not answer");
+            if !pauses.wait(self.patience).await {
+                return Err(self.unreachable(problem));
+            }
+        }
+    }
+
+    async fn try_register(&mut self) -> Result<Session, CallError> {
+        let request = v1::RegisterRequest {
+            worker_name: self.name.clone(),
+            threads: self.threads,
+            format_version: FORMAT_VERSION,
+            newest_epoch: self.newest.as_ref().map_or(0, |(_, epoch)| *epoch),
+        };
+        let answer = match self.client.register(request).await {
+            Ok(answer) => answer.into_inner(),
+            Err(status) => {
+                let error = CallError::from(status);
+                // It may be of another bake, whose epochs have nothing to do with ours.
+                if matches!(error, CallError::RegisterAgain) && self.is_of_another_bake().await {
+                    self.newest = None;
+                }
+                return Err(error);
+            }
+        };
+        match &self.newest {
+            Some((bake, epoch)) if *bake == answer.bake_id && *epoch > answer.epoch => {
+                return Err(CallError::RegisterAgain);
+            }
+            _ => self.newest = Some((answer.bake_id.clone(), answer.epoch)),
+        }
+        Ok(Session {
+            worker: answer.worker_id,
+            epoch: answer.epoch,
+            bake_id: answer.bake_id,
+            store_location: answer.store_location,
+            scene_uri: answer.scene_uri,
+            scene_digest: answer.scene_digest,
+            heartbeat: Duration::from_millis(answer.heartbeat_ms.max(1)),
+        })
+    }
+
+    async fn is_of_another_bake(&mut self) -> bool {
+        match (self.client.get_status(v1::GetStatusRequest {}).await, &self.newest) {
+            (Ok(status), Some((bake, _))) => status.get_ref().bake_id != *bake,
+            _ => false,
+        }
+    }
+
+    /// Calls until there is an answer, registering is needed, or the time is up.
+    pub async fn call<T>(
+        &self,
+        mut call: impl AsyncFnMut(Client) -> Result<T, Status>,
+    ) -> Result<Result<T, CallError>, WorkerError> {
+        let mut pauses = Pauses::new();
+        loop {
+            match call(self.client.clone()).await.map_err(CallError::from) {
+                Err(CallError::TryAgain(problem)) => {
+                    tracing::debug!(problem, "a call failed");
+                    if !pauses.wait(self.patience).await {
+                        return Err(self.unreachable(problem));
+                    }
+                }
+                other => return Ok(other),
+            }
+        }
+    }
+
+    fn unreachable(&self, problem: String) -> WorkerError {
+        WorkerError::Unreachable { url: self.url.clone(), waited: self.patience, problem }
+    }
+}

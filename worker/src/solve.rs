@@ -1,0 +1,69 @@
+//! What a task computes.
+//!
+//! Everything here is a pure function of the scene, the plan's entries, the configuration and the
+//! rows of the segments: no store, no network, no clock. VI-3: the result does not depend on the
+//! worker, its threads or the order of its tasks.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use sightline_geometry::{Sampling, SegmentId, ViewSegment};
+use sightline_jobs::{BakeConfig, PlannedCell};
+use sightline_scene::Scene;
+use sightline_store::{CellRow, ObjectRow, SegmentRow};
+
+use crate::cell::finish_cell;
+pub use crate::pool::Cancel;
+
+/// Solves segments, in order. `None` when it was cancelled.
+#[must_use]
+pub fn solve_segments(
+    scene: &Scene,
+    segments: &[ViewSegment],
+    config: &BakeConfig,
+    cancel: &Cancel,
+) -> Option<Vec<SegmentRow>> {
+    let sampling = Sampling::new(config.solver.rows);
+    segments
+        .par_iter()
+        .map(|segment| (!cancel.is_cancelled()).then(|| solve_segment(scene, segment, sampling)))
+        .collect()
+}
+
+/// The one place that calls the solver.
+#[must_use]
+pub fn solve_segment(scene: &Scene, segment: &ViewSegment, sampling: Sampling) -> SegmentRow {
+    let found = sightline_solver::solve_segment(&scene.geometry, segment, sampling);
+    SegmentRow { segment: segment.id, set: found.set, weights: found.weights }
+}
+
+/// The rows of the dataset for one cell.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CellOutput {
+    /// The cell's row.
+    pub cell: CellRow,
+    /// One row an object of which a primitive is visible, ascending.
+    pub objects: Vec<ObjectRow>,
+}
+
+/// Finishes cells, in order. `None` when it was cancelled. `rows` holds at least the rows of the
+/// cells' segments.
+///
+/// # Panics
+/// When a row is missing: the caller reads them all.
+#[must_use]
+pub fn solve_cells(
+    scene: &Scene,
+    cells: &[PlannedCell],
+    rows: &BTreeMap<SegmentId, SegmentRow>,
+    config: &BakeConfig,
+    cancel: &Cancel,
+) -> Option<Vec<CellOutput>> {
+    cells
+        .par_iter()
+        .map(|planned| {
+            let rows: Vec<&SegmentRow> = planned.segments.iter().map(|id| &rows[id]).collect();
+            (!cancel.is_cancelled()).then(|| finish_cell(scene, config, planned, &rows))
+        })
+        .collect()
+}

@@ -1,0 +1,366 @@
+//! The life of a worker.
+//!
+//! ```text
+//!   register --> open store, plan, scene --> lease --> attempt --> report --+
+//!      ^                                       ^                            |
+//!      |  the coordinator changed              +----------------------------+
+//!      +---------------------------------------|
+//!                                              | finished, or asked to stop
+//!                                              v
+//!                                           goodbye
+//! ```
+
+use std::future::Future;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use sightline_jobs::{FailureClass, Plan, TaskId};
+use sightline_proto::{decode_plan, v1};
+use sightline_scene::{OpenOptions, Scene};
+use sightline_store::{BakeStore, keys};
+use tonic::Request;
+
+use crate::WorkerError;
+use crate::attempt::Bake;
+use crate::connection::{CallError, Client, Connection, Session};
+use crate::error::AttemptError;
+use crate::pool::{Cancel, SolvePool};
+
+/// How long a goodbye may take.
+const GOODBYE_TIME: Duration = Duration::from_secs(1);
+
+/// How to work.
+#[derive(Clone)]
+pub struct WorkerOptions {
+    /// URL of the coordinator, `http://host:port`.
+    pub coordinator: String,
+    /// The store; where the coordinator says when `None`.
+    pub store: Option<BakeStore>,
+    /// Path of the scene; where the coordinator says when `None`.
+    pub scene_path: Option<PathBuf>,
+    /// The scene, when it is in memory already.
+    pub scene: Option<Arc<Scene>>,
+    /// Threads to solve with; 0 stands for one a core.
+    pub threads: usize,
+    /// A name for people; need not be unique.
+    pub name: String,
+    /// How long to look for a coordinator that does not answer.
+    pub patience: Duration,
+}
+
+impl WorkerOptions {
+    /// Options with the defaults of the command.
+    #[must_use]
+    pub fn new(coordinator: &str) -> Self {
+        Self {
+            coordinator: coordinator.to_owned(),
+            store: None,
+            scene_path: None,
+            scene: None,
+            threads: 0,
+            name: "worker".into(),
+            patience: Duration::from_secs(60),
+        }
+    }
+}
+
+/// What a worker did.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct WorkerSummary {
+    /// Tasks it committed, or found committed.
+    pub tasks: u64,
+    /// Attempts of its that failed.
+    pub failures: u64,
+    /// Time spent in computing.
+    pub solve_time: Duration,
+    /// True when the bake ended with a dataset; false when it failed or the worker was stopped.
+    pub published: bool,
+    /// How the bake ended, for people.
+    pub message: String,
+}
+
+/// A worker.
+pub struct Worker;
+
+impl Worker {
+    /// Works until the bake is over or `stop` resolves. On `stop`, the current task is given up
+    /// and its lease goes back at once.
+    ///
+    /// # Errors
+    /// When the coordinator cannot be reached for too long or refuses this worker, or the store,
+    /// the plan or the scene cannot be used.
+    pub async fn run(
+        options: WorkerOptions,
+        stop: impl Future<Output = ()> + Send,
+    ) -> Result<WorkerSummary, WorkerError> {
+        let pool = SolvePool::new(options.threads)?;
+        let connection =
+            Connection::new(&options.coordinator, &options.name, pool.threads(), options.patience)?;
+        let mut life =
+            Life { options, pool, connection, session: None, summary: WorkerSummary::default() };
+        let ended = tokio::select! {
+            ended = life.work() => Some(ended),
+            () = stop => None,
+        };
+        // Who was told that the bake is over has been let go already.
+        if !matches!(ended, Some(Ok(()))) {
+            life.goodbye().await;
+        }
+        ended.unwrap_or(Ok(())).map(|()| life.summary)
+    }
+}
+
+/// A running worker.
+struct Life {
+    options: WorkerOptions,
+    pool: SolvePool,
+    connection: Connection,
+    session: Option<Session>,
+    summary: WorkerSummary,
+}
+
+/// A task that was leased.
+struct Leased {
+    task: TaskId,
+    lease: u64,
+    attempt: String,
+}
+
+impl Life {
+    /// Until the bake is over.
+    async fn work(&mut self) -> Result<(), WorkerError> {
+        let mut bake: Option<Arc<Bake>> = None;
+        loop {
+            let session = self.connection.register().await?;
+            tracing::info!(bake = session.bake_id, epoch = session.epoch, "registered");
+            self.session = Some(session.clone());
+            let opened = match bake.take() {
+                Some(bake) if bake.plan.bake_id == session.bake_id => bake,
+                _ => self.open_alive(&session).await?,
+            };
+            if self.serve(&session, &opened).await? {
+                return Ok(());
+            }
+            bake = Some(opened);
+        }
+    }
+
+    /// Opens a bake; heartbeats meanwhile, since reading a scene can take longer than a lease.
+    async fn open_alive(&self, session: &Session) -> Result<Arc<Bake>, WorkerError> {
+        let alive = heartbeats(self.connection.client.clone(), session.clone(), None, None);
+        tokio::select! {
+            opened = self.open(session) => opened,
+            never = alive => match never {},
+        }
+    }
+
+    async fn open(&self, session: &Session) -> Result<Arc<Bake>, WorkerError> {
+        let store = match &self.options.store {
+            Some(store) => store.clone(),
+            None => BakeStore::open(&session.store_location)?,
+        };
+        let bytes = store.get(&keys::plan(&session.bake_id)).await?;
+        let plan = decode_plan(&bytes)
+            .map_err(|source| WorkerError::Plan { bake_id: session.bake_id.clone(), source })?;
+        let scene = self.open_scene(session, &plan).await?;
+        Ok(Arc::new(Bake::new(store, plan, scene, self.pool.clone())))
+    }
+
+    async fn open_scene(&self, session: &Session, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
+        let path = self.options.scene_path.clone();
+        let path = path.unwrap_or_else(|| PathBuf::from(&session.scene_uri));
+        let scene = match &self.options.scene {
+            Some(scene) => Arc::clone(scene),
+            None => self.read_scene(&path, plan).await?,
+        };
+        if scene.digest.combined == session.scene_digest {
+            return Ok(scene);
+        }
+        Err(WorkerError::OtherScene {
+            path: path.display().to_string(),
+            found: scene.digest.combined.clone(),
+            expected: session.scene_digest.clone(),
+        })
+    }
+
+    async fn read_scene(&self, path: &Path, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
+        let mut options = OpenOptions::default();
+        options.see_through.clone_from(&plan.config.scene.see_through);
+        let path = path.to_owned();
+        let read = self.pool.run(move || Scene::open(&path, &options)).await;
+        let scene = read.map_err(|panic| WorkerError::Defect(panic.to_string()))??;
+        Ok(Arc::new(scene))
+    }
+
+    /// Leases and attempts tasks. True when the bake is over, false when registering is needed.
+    async fn serve(&mut self, session: &Session, bake: &Arc<Bake>) -> Result<bool, WorkerError> {
+        loop {
+            let request = v1::LeaseRequest { worker_id: session.worker, epoch: session.epoch };
+            let answer =
+                self.connection.call(async |mut client| client.lease(request).await).await?;
+            let answer = match answer {
+                Ok(answer) => answer.into_inner().answer,
+                Err(error) => return again_or_refused(error),
+            };
+            match answer {
+                Some(v1::lease_response::Answer::Task(task)) => {
+                    let leased = Leased {
+                        task: TaskId(task.task),
+                        lease: task.lease_id,
+                        attempt: task.attempt,
+                    };
+                    if !self.attempt(session, bake, &leased).await? {
+                        return Ok(false);
+                    }
+                }
+                Some(v1::lease_response::Answer::Wait(wait)) => {
+                    tokio::time::sleep(Duration::from_millis(wait.retry_after_ms)).await;
+                }
+                Some(v1::lease_response::Answer::Finished(finished)) => {
+                    tracing::info!(message = finished.message, "the bake is over");
+                    self.summary.published = finished.published;
+                    self.summary.message = finished.message;
+                    return Ok(true);
+                }
+                None => return Err(WorkerError::Refused("a LeaseResponse has no answer".into())),
+            }
+        }
+    }
+
+    /// Attempts a task and reports. False when registering is needed.
+    async fn attempt(
+        &mut self,
+        session: &Session,
+        bake: &Arc<Bake>,
+        leased: &Leased,
+    ) -> Result<bool, WorkerError> {
+        if leased.task.index() >= bake.plan.tasks.len() {
+            return Err(WorkerError::Refused(format!("the plan has no task {}", leased.task)));
+        }
+        let lost = Cancel::default();
+        // Dropped when the worker is stopped: the computation then ends by itself.
+        let guard = CancelOnDrop(lost.clone());
+        let alive = heartbeats(
+            self.connection.client.clone(),
+            session.clone(),
+            Some(leased.lease),
+            Some(lost.clone()),
+        );
+        let outcome = tokio::select! {
+            outcome = bake.attempt(leased.task, &leased.attempt, &lost) => outcome,
+            never = alive => match never {},
+        };
+        drop(guard);
+        self.count(leased, &outcome);
+        let result = report_of(&outcome);
+        let report = v1::ReportRequest {
+            worker_id: session.worker,
+            epoch: session.epoch,
+            lease_id: leased.lease,
+            task: leased.task.0,
+            result: Some(result),
+        };
+        let sent =
+            self.connection.call(async |mut client| client.report(report.clone()).await).await?;
+        match sent {
+            Ok(_) => Ok(true),
+            // The coordinator has answered with a failure of the task.
+            Err(CallError::Refused(reason)) => {
+                tracing::warn!(task = leased.task.0, reason, "a report was refused");
+                Ok(true)
+            }
+            // The next coordinator lists the commit.
+            Err(_) => Ok(false),
+        }
+    }
+
+    fn count(&mut self, leased: &Leased, outcome: &Result<Duration, AttemptError>) {
+        match outcome {
+            Ok(solve_time) => {
+                tracing::debug!(task = leased.task.0, ?solve_time, "committed");
+                self.summary.tasks += 1;
+                self.summary.solve_time += *solve_time;
+            }
+            Err(error) => {
+                tracing::warn!(task = leased.task.0, %error, "an attempt failed");
+                self.summary.failures += 1;
+            }
+        }
+    }
+
+    /// Gives leases back at once; does not insist.
+    async fn goodbye(&mut self) {
+        let Some(session) = &self.session else { return };
+        let mut request =
+            Request::new(v1::GoodbyeRequest { worker_id: session.worker, epoch: session.epoch });
+        request.set_timeout(GOODBYE_TIME);
+        if let Err(status) = self.connection.client.goodbye(request).await {
+            tracing::debug!(%status, "the goodbye was not heard");
+        }
+    }
+}
+
+struct CancelOnDrop(Cancel);
+
+impl Drop for CancelOnDrop {
+    fn drop(&mut self) {
+        self.0.cancel();
+    }
+}
+
+fn again_or_refused(error: CallError) -> Result<bool, WorkerError> {
+    match error {
+        CallError::Refused(reason) => Err(WorkerError::Refused(reason)),
+        CallError::RegisterAgain | CallError::TryAgain(_) => Ok(false),
+    }
+}
+
+fn report_of(outcome: &Result<Duration, AttemptError>) -> v1::report_request::Result {
+    use v1::report_request::Result as Report;
+    match outcome {
+        Ok(solve_time) => Report::Committed(v1::Committed {
+            solve_ms: u64::try_from(solve_time.as_millis()).unwrap_or(u64::MAX),
+        }),
+        Err(AttemptError::GivenUp) => Report::Released(v1::Released {}),
+        Err(error) => {
+            let class: FailureClass = error.class();
+            Report::Failed(v1::Failed {
+                class: v1::FailureClass::from(class).into(),
+                reason: error.to_string(),
+            })
+        }
+    }
+}
+
+/// Extends the lease for ever. When the coordinator says that it is lost, `lost` is cancelled. A
+/// coordinator that does not answer is no reason to give up: the commit decides.
+async fn heartbeats(
+    mut client: Client,
+    session: Session,
+    lease: Option<u64>,
+    lost: Option<Cancel>,
+) -> std::convert::Infallible {
+    let mut beat = tokio::time::interval(session.heartbeat);
+    beat.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    beat.tick().await;
+    loop {
+        beat.tick().await;
+        let mut request = Request::new(v1::HeartbeatRequest {
+            worker_id: session.worker,
+            epoch: session.epoch,
+            lease_ids: lease.into_iter().collect(),
+        });
+        request.set_timeout(session.heartbeat);
+        match client.heartbeat(request).await {
+            Ok(answer) if !answer.get_ref().lost_lease_ids.is_empty() => {
+                tracing::info!("the lease is lost; the task is given up");
+                if let Some(lost) = &lost {
+                    lost.cancel();
+                }
+            }
+            Ok(_) => {}
+            Err(status) => tracing::debug!(%status, "a heartbeat was not heard"),
+        }
+    }
+}
