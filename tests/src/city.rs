@@ -13,13 +13,13 @@ use crate::process;
 /// Longest time that a command on the city may take; far more than it needs, even beside others.
 pub const LIMIT: Duration = Duration::from_secs(300);
 
-/// Flags of the bake but scene and folder: a stretch of the street at x = 0, 16 cells of 5 m.
+/// Flags of the bake but scene and folder: a stretch of the street at x = 0, cells of 5 m.
 /// Few units a task, so that there is something to kill and to resume.
 const STREET: [&str; 12] = [
-    "--region=-5,-20,5,20",
+    "--region=-5,-10,5,10",
     "--cell-size=5",
     "--eye-height=1.5,1.8",
-    "--rows=100",
+    "--rows=64",
     "--heldout-viewpoints=8",
     "--heldout-rays=2000",
     "--target-error=0.0001",
@@ -29,6 +29,9 @@ const STREET: [&str; 12] = [
     "--cells-per-task=2",
     "--verticals=false",
 ];
+
+/// Cells of that stretch.
+pub const CELLS: u32 = 8;
 
 /// A city, baked once by `sightline bake`.
 #[derive(Debug)]
@@ -74,7 +77,8 @@ pub fn generate(scene: &Path, seed: u32) {
 /// `bake` or `coordinator`, of the street of the city.
 #[must_use]
 pub fn bake_arguments(command: &str, scene: &Path, out: &Path) -> Vec<OsString> {
-    let mut arguments: Vec<OsString> = vec![command.into(), scene.into(), "--out".into(), out.into()];
+    let mut arguments: Vec<OsString> =
+        vec![command.into(), scene.into(), "--out".into(), out.into()];
     arguments.extend(STREET.map(OsString::from));
     arguments
 }

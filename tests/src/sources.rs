@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 use crate::workspace;
 
 /// Folders that are built or installed, never written by hand.
-const MADE: [&str; 6] = [".git", "target", ".venv", "node_modules", "out", "__pycache__"];
+const MADE: [&str; 7] =
+    [".git", "target", ".venv", "node_modules", "out", "sightline-demo", "__pycache__"];
 
 /// Every file of the repository, relative to its top folder, sorted.
 ///
@@ -59,7 +60,9 @@ impl std::fmt::Display for Line {
 pub fn is_product(file: &Path) -> bool {
     let parts: Vec<_> = file.components().map(|c| c.as_os_str().to_string_lossy()).collect();
     file.extension().is_some_and(|e| e == "rs")
-        && parts.first().is_some_and(|p| ["crates", "coordinator", "worker", "proto"].contains(&&**p))
+        && parts
+            .first()
+            .is_some_and(|p| ["crates", "coordinator", "worker", "proto"].contains(&&**p))
         && parts.iter().any(|p| p == "src")
 }
 

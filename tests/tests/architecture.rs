@@ -113,7 +113,8 @@ fn kernels_and_scheduling_reach_neither_async_nor_files_nor_formats() {
     for name in PURE {
         let package = workspace.members().find(|p| short(&p.name) == name);
         let reach = workspace.reach_of(package.expect("the crate exists"));
-        let wrong: Vec<_> = ASYNC_FILES_AND_FORMATS.iter().filter(|b| reach.contains(**b)).collect();
+        let wrong: Vec<_> =
+            ASYNC_FILES_AND_FORMATS.iter().filter(|b| reach.contains(**b)).collect();
         assert!(wrong.is_empty(), "{name} reaches {wrong:?}");
     }
 }
@@ -185,7 +186,9 @@ fn a_type_lives_where_it_has_a_meaning() {
     let vague = ["util", "utils", "common", "misc", "helper", "helpers"];
     let is_vague = |f: &PathBuf| {
         let parts = f.components().map(|c| c.as_os_str().to_string_lossy().into_owned());
-        parts.map(|p| p.split('.').next().unwrap_or_default().to_owned()).any(|p| vague.contains(&&*p))
+        parts
+            .map(|p| p.split('.').next().unwrap_or_default().to_owned())
+            .any(|p| vague.contains(&&*p))
     };
     let found: Vec<PathBuf> = sources::files().into_iter().filter(is_vague).collect();
     assert!(found.is_empty(), "{found:?}");
@@ -212,7 +215,8 @@ fn invariants_are_quoted_by_numbers_that_exist() {
             quoted.extend(numbered(line).map(|name| (name, file.clone())));
         }
     }
-    let series: BTreeSet<&str> = defined.iter().filter_map(|d| Some(d.split_once('-')?.0)).collect();
+    let series: BTreeSet<&str> =
+        defined.iter().filter_map(|d| Some(d.split_once('-')?.0)).collect();
     assert!(["VI", "JB"].iter().all(|s| series.contains(s)), "{series:?}");
     let is_unknown = |name: &str| {
         name.split_once('-').is_some_and(|(s, _)| series.contains(s)) && !defined.contains(name)
@@ -250,7 +254,11 @@ fn lock_files_name_no_place_to_download_from() {
             }
             "package-lock.json" | "npm-shrinkwrap.json" => {
                 let has_place = workspace::read(&file).contains("\"resolved\"");
-                assert!(!has_place, "{}: npm needs omit-lockfile-registry-resolved", file.display());
+                assert!(
+                    !has_place,
+                    "{}: npm needs omit-lockfile-registry-resolved",
+                    file.display()
+                );
             }
             "requirements.txt" | ".npmrc" | "pip.conf" => {
                 let has_place = workspace::read(&file).contains("://");

@@ -12,7 +12,7 @@ use sightline_proto::v1::GetStatusRequest;
 use sightline_proto::v1::coordinator_client::CoordinatorClient;
 use sightline_store::{BakeStore, CellEntry, Dataset};
 use sightline_tests::binaries::{executable, sightline};
-use sightline_tests::city::{self, City, LIMIT};
+use sightline_tests::city::{self, CELLS, City, LIMIT};
 use sightline_tests::process::{self, Process, eventually};
 use sightline_tests::{dataset, requirement};
 use tonic::transport::Endpoint;
@@ -89,7 +89,8 @@ impl Cluster {
     /// dataset must not depend on it.
     fn of_sightline(name: &str) -> Self {
         Self::start(name, |dataset, listen| {
-            let mut command = sightline(city::bake_arguments("coordinator", &baked().scene, dataset));
+            let mut command =
+                sightline(city::bake_arguments("coordinator", &baked().scene, dataset));
             command.args(["--segments-per-task=3", "--cells-per-task=1", "--listen", listen]);
             command
         })
@@ -106,7 +107,7 @@ fn bake_says_what_it_did() {
     let city = baked();
     let cells = number(&city.summary["cells"]);
     assert_eq!(cells, entries(city).len() as f64, "{:#}", city.summary);
-    assert_eq!(cells, 16.0, "the street is free, so no cell is skipped");
+    assert_eq!(cells, f64::from(CELLS), "the street is free, so no cell is skipped");
 }
 
 #[test]
@@ -168,8 +169,8 @@ fn a_killed_coordinator_is_replaced_by_another() {
 fn thin_binaries_write_the_bytes_of_bake() {
     let config = baked().folder.join("bake.toml");
     let text = "\
-        [region]\nrectangles = [[-5.0, -20.0, 5.0, 20.0]]\ncell_size = 5.0\n\
-        [solver]\nrows = 100\n\
+        [region]\nrectangles = [[-5.0, -10.0, 5.0, 10.0]]\ncell_size = 5.0\n\
+        [solver]\nrows = 64\n\
         [accuracy]\nheldout_viewpoints = 8\nheldout_rays = 2000\ntarget_error = 0.0001\n\
         worst_error = 0.001\nrounds = 3\n";
     std::fs::write(&config, text).expect("the configuration can be written");
@@ -255,7 +256,6 @@ fn verify_fails_over_a_limit() {
 
 #[test]
 fn the_worst_viewpoint_command_reproduces_its_figure() {
-    // The sparsest possible rays and a seed of its own, so that the worst is not always the same.
     let worst = verify(&["--seed=3"]).success().json()["worst"].clone();
     let command = worst["command"].as_str().expect("the command is a text");
     let folder = executable("sightline").parent().expect("it is in a folder");
@@ -339,12 +339,12 @@ fn duckdb_answers_the_two_questions() {
     let Some(python) = requirement::program(test, found, install) else { return };
     let script = sightline_tests::workspace::root().join("tests/analytics/query_dataset.py");
     let answers = run(Command::new(python).arg(script).arg(&baked().dataset)).success().json();
-    assert_eq!(answers["cells"], 16);
+    assert_eq!(answers["cells"], CELLS);
     let objects = answers["top_objects"].as_array().expect("a list of objects");
     assert_eq!(objects.len(), 10, "the ten objects seen from most cells");
     let histogram = answers["set_size_histogram"].as_array().expect("a histogram");
     let counted: u64 = histogram.iter().filter_map(|row| row["cells"].as_u64()).sum();
-    assert_eq!(counted, 16, "every cell is in one class: {answers:#}");
+    assert_eq!(counted, u64::from(CELLS), "every cell is in one class: {answers:#}");
 }
 
 #[test]
@@ -353,7 +353,7 @@ fn info_describes_scene_dataset_and_cell() {
     let triangles = number(&scene["report"]["instanced_triangles"]);
     assert!((29_000.0..31_000.0).contains(&triangles), "{triangles}");
     let dataset = info(&baked().dataset, &[]);
-    assert_eq!(number(&dataset["summary"]["cells"]), 16.0, "{dataset:#}");
+    assert_eq!(number(&dataset["summary"]["cells"]), f64::from(CELLS), "{dataset:#}");
     let missing = run(sightline(["info", "--cell=99"]).arg(&baked().dataset)).failure(3);
     assert!(missing.stderr.contains("cell 99"), "{}", missing.stderr);
 }
@@ -391,7 +391,7 @@ async fn ask(url: String) -> Result<(), Box<dyn std::error::Error>> {
     assert!(names.contains(&coordinator), "{names:?}");
     let status = CoordinatorClient::new(channel).get_status(GetStatusRequest {}).await?;
     let status = status.into_inner();
-    assert_eq!(status.cells.map(|c| c.total), Some(16), "{status:?}");
+    assert_eq!(status.cells.map(|c| c.total), Some(u64::from(CELLS)), "{status:?}");
     Ok(())
 }
 

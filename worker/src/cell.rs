@@ -2,14 +2,17 @@
 //!
 //! 1. The set is the union of the sets of the cell's segments, and of the triangles that reach
 //!    into the cell: those are visible from viewpoints close to them, whatever the perimeter sees.
-//! 2. The error of the set is measured with rays from *held-out* viewpoints, random in the cell,
+//! 2. Where geometry reaches into the cell it may be cut into pockets that no segment of the
+//!    perimeter enters: the inside of furniture, or of a hut. Many *scouts*, random viewpoints
+//!    with few rays each, look for them; one wrong ray makes a scout a suspect.
+//! 3. The error of the set is measured with rays from *held-out* viewpoints, random in the cell,
 //!    that no segment was chosen for. Rays are cast over the hierarchy: the measurement shares no
-//!    code with the solver.
-//! 3. While the mean or the worst error is over its target and rounds are left, lines of the cell
-//!    through the worst of these viewpoints are solved too, and the set is measured again at fresh
-//!    viewpoints. A line runs across the whole footprint at the viewpoint's relative height;
-//!    on the bilinear surface of a cell it is straight. So pockets that the perimeter does not
-//!    see into, behind furniture or under a roof inside the cell, are found where they are.
+//!    code with the solver. Where the mean or the worst error is over its target and rounds are
+//!    left, these viewpoints are suspects, and the set is measured again at fresh ones.
+//! 4. Suspects whose error is confirmed are dealt with one by one, the worst first: a line of the
+//!    cell through the viewpoint is solved, and what remains wrong is measured again. A line runs
+//!    across the whole footprint at the viewpoint's relative height; on the bilinear surface of a
+//!    cell it is straight.
 //!
 //! Everything is seeded by the cell's number and the round, so the row is a function of scene and
 //! configuration alone.
@@ -18,23 +21,89 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 use sightline_geometry::{
-    CellId, InstancedGeometry, ObjectId, PrimitiveSet, Sampling, SegmentId, ViewCell, ViewSegment,
+    CellId, ObjectId, PrimitiveSet, Sampling, SegmentId, ViewCell, ViewSegment,
     overlap::primitives_in_cell,
 };
-use sightline_jobs::{AccuracyConfig, BakeConfig, PlannedCell};
+use sightline_jobs::{BakeConfig, PlannedCell};
 use sightline_quality::{CellError, measure_viewpoints, random_viewpoints};
 use sightline_scene::Scene;
 use sightline_store::{CellRow, ObjectRow, SegmentRow};
 
 use crate::solve::{CellOutput, solve_segment};
 
-/// Lines that one refinement round solves at most. More find more a round, but a line through
-/// one viewpoint of a pocket usually ends the error at the others too.
-const LINES_PER_ROUND: usize = 4;
+/// Lines that are solved at most for one list of suspects: a cell of furniture has a handful of
+/// pockets, and a cell of leaves would never end.
+const LINES_MAX: usize = 12;
 
 /// Base of the seeds of held-out viewpoints ("sightline" on a keypad); the round is added. Far
 /// from the small seeds that people give to `verify`, which has to be independent.
 const HELDOUT_SEED: u64 = 744_485_463_000_000;
+
+/// Seed of the scouts, away from those of the rounds.
+const SCOUT_SEED: u64 = HELDOUT_SEED + 1_000_000;
+
+/// Seed of the measurements of suspects.
+const SUSPECT_SEED: u64 = HELDOUT_SEED + 2_000_000;
+
+/// A viewpoint where something is missing.
+struct Suspect {
+    viewpoint: DVec3,
+    error: f64,
+    /// Lines solved through it.
+    lines: u32,
+}
+
+/// A cell's visible set while it grows.
+struct Sight<'a> {
+    scene: &'a Scene,
+    config: &'a BakeConfig,
+    cell: &'a ViewCell,
+    set: PrimitiveSet,
+    /// What was solved beyond the planned segments.
+    lines: Vec<SegmentRow>,
+    /// Rays cast from held-out viewpoints and scouts.
+    rays: u64,
+}
+
+impl Sight<'_> {
+    fn measure(&mut self, viewpoints: &[DVec3], rays: u32, seed: u64) -> CellError {
+        self.rays += u64::from(rays) * viewpoints.len() as u64;
+        let geometry = &self.scene.geometry;
+        measure_viewpoints(geometry, &self.set, self.cell.id, viewpoints, rays, seed)
+    }
+
+    /// Viewpoints of scouts that saw something wrong.
+    fn scout(&mut self) -> Vec<DVec3> {
+        let accuracy = &self.config.accuracy;
+        let scouts = random_viewpoints(self.cell, accuracy.scouts, SCOUT_SEED);
+        let found = self.measure(&scouts, accuracy.scout_rays, SCOUT_SEED);
+        found.viewpoints.iter().filter(|v| v.wrong > 0).map(|v| v.viewpoint).collect()
+    }
+
+    /// Solves lines through suspects until the error at each is down to the target, or a line
+    /// along either direction did not help.
+    fn look_from(&mut self, suspects: Vec<DVec3>) {
+        let accuracy = &self.config.accuracy;
+        let sampling = Sampling::new(self.config.solver.rows);
+        let suspect = |viewpoint| Suspect { viewpoint, error: 0.0, lines: 0 };
+        let mut left: Vec<Suspect> = suspects.into_iter().map(suspect).collect();
+        for _ in 0..LINES_MAX {
+            let viewpoints: Vec<DVec3> = left.iter().map(|s| s.viewpoint).collect();
+            let found = self.measure(&viewpoints, accuracy.heldout_rays, SUSPECT_SEED);
+            for (suspect, found) in left.iter_mut().zip(&found.viewpoints) {
+                suspect.error = found.error;
+            }
+            left.retain(|s| s.error > accuracy.target_error && s.lines < 2);
+            let worst = left.iter_mut().max_by(|a, b| a.error.total_cmp(&b.error));
+            let Some(worst) = worst else { break };
+            worst.lines += 1;
+            let line = line_through(self.cell, worst.viewpoint, worst.lines == 1);
+            let seen = solve_segment(self.scene, &line, sampling);
+            self.set = PrimitiveSet::union([&self.set, &seen.set]);
+            self.lines.push(seen);
+        }
+    }
+}
 
 /// The rows of a finished cell. `rows` are the sets of `planned.segments`, in that order.
 ///
@@ -46,70 +115,47 @@ pub fn finish_cell(
     planned: &PlannedCell,
     rows: &[&SegmentRow],
 ) -> CellOutput {
-    let (geometry, cell, accuracy) = (&scene.geometry, &planned.cell, &config.accuracy);
-    let sampling = Sampling::new(config.solver.rows);
-    let inside = primitives_in_cell(geometry, cell);
-    let mut set = PrimitiveSet::union(rows.iter().map(|r| &r.set).chain([&inside]));
-    let mut lines: Vec<SegmentRow> = Vec::new();
-    let (mut rounds, mut rays) = (0, 0);
+    let (cell, accuracy) = (&planned.cell, &config.accuracy);
+    let inside = primitives_in_cell(&scene.geometry, cell);
+    let set = PrimitiveSet::union(rows.iter().map(|r| &r.set).chain([&inside]));
+    let mut sight = Sight { scene, config, cell, set, lines: Vec::new(), rays: 0 };
+    if accuracy.rounds > 0 && !inside.is_empty() {
+        let suspects = sight.scout();
+        sight.look_from(suspects);
+    }
+    let mut rounds = 0;
     let error = loop {
-        let error = heldout_error(geometry, &set, cell, accuracy, rounds);
-        rays += error.viewpoints.iter().map(|v| u64::from(v.rays)).sum::<u64>();
+        let seed = HELDOUT_SEED + u64::from(rounds);
+        let heldout = random_viewpoints(cell, accuracy.heldout_viewpoints, seed);
+        let error = sight.measure(&heldout, accuracy.heldout_rays, seed);
         let good = error.mean() <= accuracy.target_error && error.max() <= accuracy.worst_error;
         if good || rounds >= accuracy.rounds {
             break error;
         }
         rounds += 1;
-        for line in lines_through_worst(cell, &error, accuracy.target_error, rounds) {
-            let seen = solve_segment(scene, &line, sampling);
-            set = PrimitiveSet::union([&set, &seen.set]);
-            lines.push(seen);
-        }
+        sight.look_from(worst_first(&error));
     };
-    let solved: Vec<&SegmentRow> = rows.iter().copied().chain(&lines).collect();
+    let solved: Vec<&SegmentRow> = rows.iter().copied().chain(&sight.lines).collect();
     CellOutput {
-        objects: object_rows(scene, cell.id, &solved, &set),
+        objects: object_rows(scene, cell.id, &solved, &sight.set),
         cell: CellRow {
             cell: cell.clone(),
             tile: planned.tile,
-            set,
             segments: solved.len() as u32,
             refinements: rounds,
-            heldout_rays: rays,
+            heldout_rays: sight.rays,
             heldout_error_mean: error.mean(),
             heldout_error_max: error.max(),
+            set: sight.set,
         },
     }
 }
 
-fn heldout_error(
-    geometry: &InstancedGeometry,
-    set: &PrimitiveSet,
-    cell: &ViewCell,
-    accuracy: &AccuracyConfig,
-    round: u32,
-) -> CellError {
-    let seed = HELDOUT_SEED + u64::from(round);
-    let viewpoints = random_viewpoints(cell, accuracy.heldout_viewpoints, seed);
-    measure_viewpoints(geometry, set, cell.id, &viewpoints, accuracy.heldout_rays, seed)
-}
-
-/// Lines of the cell through the worst viewpoints whose error is over `target`. Along u and along
-/// v in turn, so that a pocket open to one side only is looked into from both.
-fn lines_through_worst(
-    cell: &ViewCell,
-    error: &CellError,
-    target: f64,
-    round: u32,
-) -> Vec<ViewSegment> {
-    let mut worst: Vec<_> = error.viewpoints.iter().filter(|v| v.error > target).collect();
-    worst.sort_by(|a, b| b.error.total_cmp(&a.error));
-    worst
-        .iter()
-        .take(LINES_PER_ROUND)
-        .enumerate()
-        .map(|(k, v)| line_through(cell, v.viewpoint, (k as u32 + round) % 2 == 0))
-        .collect()
+/// The viewpoints with an error, the worst first.
+fn worst_first(error: &CellError) -> Vec<DVec3> {
+    let mut wrong: Vec<_> = error.viewpoints.iter().filter(|v| v.wrong > 0).collect();
+    wrong.sort_by(|a, b| b.error.total_cmp(&a.error));
+    wrong.iter().map(|v| v.viewpoint).collect()
 }
 
 /// The line of constant v (`along_u`) or of constant u through a point of the cell.

@@ -113,8 +113,10 @@ pub struct BakeInput {
 
 /// `bake`.
 #[derive(Debug, Args)]
-#[command(after_long_help = "Example:\n  sightline bake city.glb --out visible --region=-50,-50,50,50\n\n\
-    Ctrl-C keeps what is done: the same command resumes the bake.")]
+#[command(
+    after_long_help = "Example:\n  sightline bake city.glb --out visible --region=-50,-50,50,50\n\n\
+    Ctrl-C keeps what is done: the same command resumes the bake."
+)]
 pub struct Bake {
     /// What to bake.
     #[command(flatten)]
@@ -544,7 +546,8 @@ mod tests {
         ]);
         let borrowed: Vec<(&str, &str)> =
             flags.overrides.iter().map(|(k, v)| (*k, v.as_str())).collect();
-        let config = BakeConfig::from_toml_with("[solver]\nrings = 3\nrows = 7", &borrowed).unwrap();
+        let config =
+            BakeConfig::from_toml_with("[solver]\nrings = 3\nrows = 7", &borrowed).unwrap();
         assert_eq!(config.region.rectangles, [[-5.0, -5.0, 5.0, 5.0], [10.0, 0.0, 20.0, 5.5]]);
         assert_eq!(config.region.polygons, [vec![[0.0, 0.0], [-1.0, 0.0], [0.0, 1.0]]]);
         assert_eq!(config.region.cell_size, 5.0);

@@ -21,6 +21,7 @@ use serde_json::json;
 use sightline_coordinator::{CoordinatorError, PrepareError};
 use sightline_jobs::ConfigError;
 use sightline_scene::SceneError;
+use sightline_scene::export::ExportError;
 use sightline_scene::generate::GenerateError;
 use sightline_store::{ErrorClass, StoreError};
 use sightline_worker::WorkerError;
@@ -222,6 +223,28 @@ impl From<GenerateError> for Failure {
     }
 }
 
+impl From<ExportError> for Failure {
+    fn from(error: ExportError) -> Self {
+        let text = error.to_string();
+        match error {
+            ExportError::Source(error) => error.into(),
+            ExportError::SourceChanged { .. } => Self::new(Kind::Input, text)
+                .with_help("run the command again; bake again when the scene has changed for good"),
+            ExportError::NotThisScene { .. } => {
+                Self::new(Kind::Input, text).with_help("the dataset is damaged; bake again")
+            }
+            ExportError::ReplacesSource { .. } => {
+                Self::new(Kind::Usage, text).with_help("give another file with -o")
+            }
+            ExportError::Write { source, .. } => {
+                Self::new(Kind::Store, format!("{text}: {source}"))
+                    .with_help("check that the folder exists, its rights and its free space")
+            }
+            _ => Self::new(Kind::Input, text),
+        }
+    }
+}
+
 impl From<PrepareError> for Failure {
     fn from(error: PrepareError) -> Self {
         match error {
@@ -229,8 +252,9 @@ impl From<PrepareError> for Failure {
             PrepareError::Scene(error) => error.into(),
             PrepareError::Region(_) => Self::new(Kind::Usage, error.to_string())
                 .with_help("`sightline bake --help` documents the keys of the region"),
-            PrepareError::NoCells { .. } => Self::new(Kind::Usage, error.to_string())
-                .with_help("`sightline info` shows the box of a scene and the names of its objects"),
+            PrepareError::NoCells { .. } => Self::new(Kind::Usage, error.to_string()).with_help(
+                "`sightline info` shows the box of a scene and the names of its objects",
+            ),
         }
     }
 }
@@ -246,9 +270,8 @@ impl From<CoordinatorError> for Failure {
             }
             CoordinatorError::Superseded { .. } => Self::new(Kind::Network, text)
                 .with_help("let the newer coordinator finish, or stop it and start this one again"),
-            CoordinatorError::Missing(_) => Self::new(Kind::Incomplete, text).with_help(
-                "what is done is kept: the same command tries the missing tasks again",
-            ),
+            CoordinatorError::Missing(_) => Self::new(Kind::Incomplete, text)
+                .with_help("what is done is kept: the same command tries the missing tasks again"),
             CoordinatorError::NoWorkers { .. } => Self::new(Kind::Network, text),
             CoordinatorError::Stopped => Self::new(Kind::Interrupted, "stopped before the end")
                 .with_help("what is done is kept: the same command resumes the bake"),

@@ -27,7 +27,8 @@ fn main() -> ExitCode {
     match commands::run(arguments.command) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            if json {
+            // A negative answer is an answer: the command has printed it.
+            if json && failure.kind != failure::Kind::Negative {
                 report::print_json(&failure.to_json());
             }
             let code = failure.kind.exit_code();

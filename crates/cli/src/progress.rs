@@ -15,8 +15,10 @@ use crate::report::{duration, thousands};
 static BARS: LazyLock<MultiProgress> = LazyLock::new(MultiProgress::new);
 static QUIET: AtomicBool = AtomicBool::new(false);
 
-/// Pause between the lines where there is no terminal.
+/// Shortest pause between the lines where there is no terminal, when there is something new.
 const PLAIN_EVERY: Duration = Duration::from_secs(5);
+/// Longest pause between these lines: silence for a minute looks like a hang.
+const PLAIN_AT_LEAST: Duration = Duration::from_secs(60);
 
 /// Switches progress and notes off.
 pub fn be_quiet() {
@@ -45,7 +47,8 @@ pub struct Progress {
     unit: &'static str,
     total: u64,
     started: Instant,
-    last_line: Instant,
+    /// When the last line was written, and the units that were done then.
+    last_line: (Instant, u64),
     /// Where it stood when it began: a resumed bake does not count what was there.
     from: Option<u64>,
 }
@@ -63,7 +66,7 @@ impl Progress {
             bar
         });
         let now = Instant::now();
-        Self { bar, what, unit, total, started: now, last_line: now, from: None }
+        Self { bar, what, unit, total, started: now, last_line: (now, 0), from: None }
     }
 
     /// Sets the number of finished units. `extra` is shown behind rate and remaining time.
@@ -80,10 +83,15 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.set_position(done);
             bar.set_message(text);
-        } else if self.last_line.elapsed() >= PLAIN_EVERY {
-            self.last_line = Instant::now();
+        } else if self.line_is_due(done) {
+            self.last_line = (Instant::now(), done);
             note(&format!("{} {}/{} {text}", self.what, thousands(done), thousands(self.total)));
         }
+    }
+
+    fn line_is_due(&self, done: u64) -> bool {
+        let (since, before) = (self.last_line.0.elapsed(), self.last_line.1);
+        since >= if done == before { PLAIN_AT_LEAST } else { PLAIN_EVERY }
     }
 
     /// Units a second since the start, and the time that is left at that rate.
@@ -96,7 +104,6 @@ impl Progress {
         let left = format!("{} left", duration(open as f64 / rate));
         (format!("{rate:.1}/s"), if open > 0 { left } else { String::new() })
     }
-
 }
 
 /// The bar goes when its command is done with it, however that came.

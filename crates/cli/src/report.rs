@@ -60,17 +60,16 @@ pub fn duration(seconds: f64) -> String {
     }
     let whole = seconds.round() as u64;
     let (hours, minutes, rest) = (whole / 3600, whole / 60 % 60, whole % 60);
-    if hours > 0 { format!("{hours} h {minutes:02} min") } else { format!("{minutes} min {rest:02} s") }
+    if hours > 0 {
+        format!("{hours} h {minutes:02} min")
+    } else {
+        format!("{minutes} min {rest:02} s")
+    }
 }
 
 /// A share of pixels in per cent, with digits down to about one pixel of a large frame.
 pub fn percent(share: f64) -> String {
     format!("{:.4} %", 100.0 * share)
-}
-
-/// A share in per cent for flags and messages: as many digits as it needs.
-pub fn ratio(full: f64, part: f64) -> String {
-    if part > 0.0 { format!("{:.1}x", full / part) } else { "-".into() }
 }
 
 /// Aligned rows of a label and a value.

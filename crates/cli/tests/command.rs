@@ -150,8 +150,7 @@ fn a_small_city_is_baked_verified_queried_and_exported() {
     let arguments: Vec<&str> = command.split(' ').skip(1).chain(["--json"]).collect();
     let repeated = json(&sightline(&arguments));
     assert_eq!(repeated["worst"]["wrong"], verified["worst"]["wrong"], "{command}");
-    let limited =
-        sightline(&["verify", path(&out), "--rays", "1k", "--max-mean=-1", "--json"]);
+    let limited = sightline(&["verify", path(&out), "--rays", "1k", "--max-mean=-1", "--json"]);
     assert_eq!(limited.status.code(), Some(1));
     assert_eq!(json(&limited)["exceeded"].as_array().unwrap().len(), 1);
 
@@ -160,16 +159,19 @@ fn a_small_city_is_baked_verified_queried_and_exported() {
     let cell = json(&sightline(&["info", path(&out), "--cell", "2", "--json"]));
     assert!(cell["visible_primitives"].as_u64().unwrap() > 0);
     let corner = &cell["corners"][0];
-    let at = format!("--at={},{},{}", 0.1 + corner[0].as_f64().unwrap(), corner[1],
-        0.1 + corner[2].as_f64().unwrap());
+    let at = format!(
+        "--at={},{},{}",
+        0.1 + corner[0].as_f64().unwrap(),
+        corner[1],
+        0.1 + corner[2].as_f64().unwrap()
+    );
     assert_eq!(stdout(&sightline(&["cell", path(&out), &at])), "2\n");
     let nowhere = sightline(&["cell", path(&out), "--at=500,0,0", "--json"]);
     assert_eq!(nowhere.status.code(), Some(1));
     assert!(json(&nowhere)["nearest"]["distance"].as_f64().unwrap() > 400.0);
 
     let exported = folder.path().join("cell.glb");
-    let export =
-        sightline(&["export", path(&out), "--cell", "2", "-o", path(&exported), "--json"]);
+    let export = sightline(&["export", path(&out), "--cell", "2", "-o", path(&exported), "--json"]);
     assert!(export.status.success(), "{}", stderr(&export));
     let described = json(&sightline(&["info", path(&exported), "--json"]));
     assert_eq!(described["report"]["instanced_triangles"], cell["visible_primitives"]);
@@ -178,8 +180,18 @@ fn a_small_city_is_baked_verified_queried_and_exported() {
     let other = bake(&["--rows", "32", "--json"]);
     assert_eq!(other.status.code(), Some(2), "a flag given twice");
     let other = sightline(&[
-        "bake", path(&scene), "--out", path(&out), "--region=-4,-4,4,4", "--cell-size", "4",
-        "--rows", "32", "--rounds", "1", "--json",
+        "bake",
+        path(&scene),
+        "--out",
+        path(&out),
+        "--region=-4,-4,4,4",
+        "--cell-size",
+        "4",
+        "--rows",
+        "32",
+        "--rounds",
+        "1",
+        "--json",
     ]);
     assert!(stderr(&other).contains("solver.rows changed from 64 to 32"), "{}", stderr(&other));
     assert_eq!(json(&other)["changed"], true);

@@ -99,6 +99,10 @@ pub struct AccuracyConfig {
     pub heldout_viewpoints: u32,
     /// Rays a held-out viewpoint.
     pub heldout_rays: u32,
+    /// Viewpoints that look for pockets in a cell that geometry reaches into.
+    pub scouts: u32,
+    /// Rays a scout.
+    pub scout_rays: u32,
     /// Refinement rounds at most; 0 switches refinement off.
     pub rounds: u32,
 }
@@ -145,6 +149,8 @@ impl Default for AccuracyConfig {
             worst_error: 0.002,
             heldout_viewpoints: 16,
             heldout_rays: 4000,
+            scouts: 1024,
+            scout_rays: 32,
             rounds: 4,
         }
     }
@@ -285,6 +291,21 @@ pub const KEYS: &[KeyDoc] = &[
         "4000",
         "rays a viewpoint",
         "Rays that measure the error at one held-out viewpoint.",
+    ),
+    key(
+        "accuracy.scouts",
+        "integer",
+        "1024",
+        "viewpoints a cell",
+        "Viewpoints that look for pockets which the perimeter does not see into, such as the inside \
+         of furniture. Only in cells that geometry reaches into; 0 for none.",
+    ),
+    key(
+        "accuracy.scout_rays",
+        "integer",
+        "32",
+        "rays a viewpoint",
+        "Rays of one scout; a single wrong one makes it a suspect that is measured in full.",
     ),
     key(
         "accuracy.rounds",

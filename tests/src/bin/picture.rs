@@ -48,7 +48,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let folder = PathBuf::from(folder);
     let painter = Painter { geometry: &scene.geometry };
     painter.street(row).write(&folder.join("street.png"))?;
-    painter.from_above(row).write(&folder.join("visible-set.png"))?;
+    painter.bird_view(row).write(&folder.join("visible-set.png"))?;
     painter.map(&rows).write(&folder.join("cells.png"))?;
     Ok(())
 }
@@ -216,7 +216,9 @@ impl Painter<'_> {
         };
         let mut free = |k: u32| {
             let ray = Ray { origin: eye, direction: direction(k) };
-            caster.closest_occluder(self.geometry, ray, 2000.0, |_| true).map_or(0.0, |h| h.distance)
+            caster
+                .closest_occluder(self.geometry, ray, 2000.0, |_| true)
+                .map_or(0.0, |h| h.distance)
         };
         let best = (0..64).max_by(|&a, &b| free(a).total_cmp(&free(b)));
         // A little to the side, so that a facade is in the picture.
@@ -224,7 +226,7 @@ impl Painter<'_> {
         (ahead + 0.25 * ahead.cross(DVec3::Y) + 0.18 * DVec3::Y).normalize()
     }
 
-    fn from_above(&self, row: &CellRow) -> Image {
+    fn bird_view(&self, row: &CellRow) -> Image {
         let (width, height) = (960, 540);
         let center = row.cell.center();
         let reach = seen_radius(self.geometry, &row.set, center).clamp(40.0, 400.0);
@@ -256,8 +258,8 @@ impl Painter<'_> {
         let largest = rows.iter().map(|r| r.set.len()).max().unwrap_or(1).max(1) as f64;
         let smallest = rows.iter().map(|r| r.set.len()).min().unwrap_or(0) as f64;
         Image::paint(width, height, |caster, x, y| {
-            let ground = center
-                + metres * DVec3::new(x - width as f64 / 2.0, 0.0, y - height as f64 / 2.0);
+            let ground =
+                center + metres * DVec3::new(x - width as f64 / 2.0, 0.0, y - height as f64 / 2.0);
             let ray = Ray { origin: DVec3::new(ground.x, top, ground.z), direction: DVec3::NEG_Y };
             let Some(hit) = self.nearest(caster, ray, |_| true) else { return DVec3::ONE };
             let light = self.light(caster, ray, hit, |_| true);

@@ -84,11 +84,7 @@ pub fn read_config(input: &BakeInput) -> Result<BakeConfig> {
 }
 
 /// Reads the scene and plans the bake, on so many threads.
-pub fn prepare_on(
-    input: &BakeInput,
-    config: BakeConfig,
-    threads: Option<u32>,
-) -> Result<Prepared> {
+pub fn prepare_on(input: &BakeInput, config: BakeConfig, threads: Option<u32>) -> Result<Prepared> {
     // Commands that look for the scene later run in other folders.
     let scene = absolute(&input.scene);
     Ok(super::on_threads(threads, || prepare(&scene, config))??)
@@ -99,17 +95,15 @@ fn absolute(path: &Path) -> PathBuf {
 }
 
 /// Opens the output folder, and says what a new bake into it has to do with the last one.
-pub async fn open_store(
-    input: &BakeInput,
-    digest: &SceneDigest,
-    plan: &Plan,
-) -> Result<BakeStore> {
+pub async fn open_store(input: &BakeInput, digest: &SceneDigest, plan: &Plan) -> Result<BakeStore> {
     let store = BakeStore::open_or_create(&input.out).map_err(|error| {
         Failure::new(Kind::Store, error.to_string()).with_help("give another folder with --out")
     })?;
     match since_last_bake(&store, digest, &plan.config).await? {
         Before::Nothing => {}
-        Before::Same => note(&format!("{} holds a bake of this input: going on with it", input.out)),
+        Before::Same => {
+            note(&format!("{} holds a bake of this input: going on with it", input.out))
+        }
         Before::Other(changes) => {
             note(&format!("{} holds a bake of other input:", input.out));
             for change in &changes {
@@ -207,11 +201,8 @@ pub async fn watch(coordinator: &mut CoordinatorHandle, mut phases: Option<&mut 
 }
 
 fn standing(status: &BakeStatus) -> String {
-    let cells = format!(
-        "{} of {} cells done",
-        thousands(status.cells.done),
-        thousands(status.cells.total)
-    );
+    let cells =
+        format!("{} of {} cells done", thousands(status.cells.done), thousands(status.cells.total));
     match status.phase {
         Phase::Merging => format!("{cells}, merging"),
         _ => cells,
@@ -248,11 +239,6 @@ async fn next_signal() -> bool {
 }
 
 impl Baked {
-    /// Figures of the dataset.
-    pub fn summary(&self) -> &Summary {
-        &self.summary
-    }
-
     fn to_json(&self) -> Value {
         let status = &self.ended.status;
         json!({

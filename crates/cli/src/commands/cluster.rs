@@ -23,10 +23,7 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
         drop(scene);
         let options = CoordinatorOptions::new(command.listen, store, plan, Arc::new(publisher));
         let mut coordinator = Coordinator::start(options).await?;
-        note(&format!(
-            "waiting for workers: sightline worker --coordinator {}",
-            coordinator.url()
-        ));
+        note(&format!("waiting for workers: sightline worker --coordinator {}", coordinator.url()));
         watch(&mut coordinator, None).await;
         Ok::<_, Failure>(coordinator.join().await?)
     })?;

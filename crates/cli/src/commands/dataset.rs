@@ -147,8 +147,7 @@ pub struct Summary {
 impl Summary {
     /// Reads all cells.
     pub async fn of(dataset: &Dataset) -> Result<Self> {
-        let mut out =
-            Self { primitives: dataset.manifest().scene.triangles, ..Self::default() };
+        let mut out = Self { primitives: dataset.manifest().scene.triangles, ..Self::default() };
         let (mut visible, mut error) = (0u64, 0.0f64);
         let mut rows = std::pin::pin!(dataset.cell_rows());
         while let Some(row) = rows.try_next().await? {

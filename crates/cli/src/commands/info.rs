@@ -172,7 +172,14 @@ async fn describe_dataset(dataset: &Dataset, command: &Info) -> Result<()> {
     let mut table = Table::default();
     table
         .row("dataset", format!("{}, manifest {}", command.path.display(), dataset.number()))
-        .row("scene", format!("{} ({})", manifest.scene.uri, &manifest.scene.hash[..16.min(manifest.scene.hash.len())]))
+        .row(
+            "scene",
+            format!(
+                "{} ({})",
+                manifest.scene.uri,
+                &manifest.scene.hash[..16.min(manifest.scene.hash.len())]
+            ),
+        )
         .row("objects", thousands(manifest.scene.objects));
     summary.add_to(&mut table);
     if let Some(b) = manifest.bounds {
@@ -183,12 +190,10 @@ async fn describe_dataset(dataset: &Dataset, command: &Info) -> Result<()> {
     }
     let totals = &manifest.totals;
     let bits = 8.0 * totals.set_bytes as f64 / totals.primitives.max(1) as f64;
-    table
-        .row("sets", format!("{} ({bits:.2} bits a member)", bytes(totals.set_bytes)))
-        .row(
-            "files",
-            format!("{} in {}", bytes(totals.file_bytes), count(manifest.files.len() as u64, "file")),
-        );
+    table.row("sets", format!("{} ({bits:.2} bits a member)", bytes(totals.set_bytes))).row(
+        "files",
+        format!("{} in {}", bytes(totals.file_bytes), count(manifest.files.len() as u64, "file")),
+    );
     let config = serde_json::to_string_pretty(&manifest.config).unwrap_or_default();
     print(&format!("{table}\nConfiguration:\n{config}\n"));
     Ok(())

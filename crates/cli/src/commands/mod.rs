@@ -37,9 +37,11 @@ pub fn run(task: Task) -> Result<()> {
 
 /// A runtime for I/O and RPC. Solving and ray casting run on threads of their own.
 fn runtime() -> Result<Runtime> {
-    tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().map_err(
-        |e| Failure::new(Kind::Defect, format!("cannot start the threads for I/O: {e}")),
-    )
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .map_err(|e| Failure::new(Kind::Defect, format!("cannot start the threads for I/O: {e}")))
 }
 
 /// Runs `work` on so many threads, or on all cores.

@@ -74,9 +74,8 @@ impl Findings {
 pub fn run(command: &Verify) -> Result<()> {
     let runtime = super::runtime()?;
     let (dataset, scene, _) = runtime.block_on(open_with_scene(&command.input))?;
-    let findings = super::on_threads(command.threads, || {
-        measure(&runtime, &dataset, &scene, command)
-    })??;
+    let findings =
+        super::on_threads(command.threads, || measure(&runtime, &dataset, &scene, command))??;
     let exceeded = exceeded(&findings, command);
     if command.json {
         print_json(&to_json(&findings, command, &exceeded));

@@ -10,11 +10,14 @@ use super::solid::Solid;
 /// above 3 m and stays within 2 m of the trunk.
 pub(super) fn blob_tree(random: &mut Random, blobs: usize) -> Solid {
     let mut solid = Solid::new();
-    solid.frustum(Material::Bark, DVec3::ZERO, (-0.2, 0.16), (4.0, 0.11), 6);
+    solid.frustum(Material::Bark, DVec3::ZERO, (-0.2, 0.16), (4.4, 0.11), 6);
     for k in 0..blobs {
         let (s, c) = super::random::sin_cos(random.angle());
         let off = if k == 0 { 0.0 } else { random.between(0.3, 0.8) };
-        let center = DVec3::new(off * s, random.between(4.3, 6.2), off * c);
+        let height = random.between(4.3, 6.2);
+        // The first one sits on the trunk.
+        let height = if k == 0 { 0.3 * height + 3.1 } else { height };
+        let center = DVec3::new(off * s, height, off * c);
         let size = random.between(0.9, 1.15);
         let material = if random.chance(0.5) { Material::Leaf } else { Material::DarkLeaf };
         solid.blob(material, center, |_| size * random.between(0.78, 1.04));
