@@ -149,7 +149,7 @@ impl Coordinator {
         let server = tokio::spawn(serve(listener, Arc::clone(&shared), server_stopped));
         let run = Run { shared, options, addr, epoch_checked_ms: 0 };
         let end = tokio::spawn(async move {
-            let end = run.to_the_end(stopped).await;
+            let end = run.drive(stopped).await;
             let _ = stop_server.send(());
             match server.await {
                 Ok(Ok(())) => end,
@@ -263,10 +263,8 @@ struct Run {
 }
 
 impl Run {
-    async fn to_the_end(
-        mut self,
-        stopped: oneshot::Receiver<()>,
-    ) -> Result<Summary, CoordinatorError> {
+    /// Runs to the end, and says goodbye to the workers.
+    async fn drive(mut self, stopped: oneshot::Receiver<()>) -> Result<Summary, CoordinatorError> {
         let shared = Arc::clone(&self.shared);
         let end = tokio::select! {
             end = self.solve_and_publish() => end,

@@ -14,8 +14,7 @@ use crate::process;
 pub const LIMIT: Duration = Duration::from_secs(300);
 
 /// Flags of the bake but scene and folder: a stretch of the street at x = 0, cells of 5 m.
-/// Few units a task, so that there is something to kill and to resume.
-const STREET: [&str; 12] = [
+const STREET: [&str; 10] = [
     "--region=-5,-10,5,10",
     "--cell-size=5",
     "--eye-height=1.5,1.8",
@@ -25,13 +24,14 @@ const STREET: [&str; 12] = [
     "--target-error=0.0001",
     "--worst-error=0.001",
     "--rounds=3",
-    "--segments-per-task=4",
-    "--cells-per-task=2",
     "--verticals=false",
 ];
 
 /// Cells of that stretch.
 pub const CELLS: u32 = 8;
+
+/// Segments and cells of a task of the shared bake.
+pub const TASK_UNITS: [u32; 2] = [4, 2];
 
 /// A city, baked once by `sightline bake`.
 #[derive(Debug)]
@@ -58,7 +58,7 @@ impl City {
         std::fs::create_dir_all(folder).expect("a folder can be made");
         let (scene, dataset) = (folder.join("city.glb"), folder.join("baked"));
         generate(&scene, 7);
-        let mut command = sightline(bake_arguments("bake", &scene, &dataset));
+        let mut command = sightline(bake_arguments("bake", &scene, &dataset, TASK_UNITS));
         let ended = process::run(command.arg("--json"), LIMIT).success();
         let summary = ended.json();
         Self { folder: folder.to_owned(), scene, dataset, summary }
@@ -74,11 +74,14 @@ pub fn generate(scene: &Path, seed: u32) {
     let _ = process::run(command.arg(seed.to_string()).arg("-o").arg(scene), LIMIT).success();
 }
 
-/// `bake` or `coordinator`, of the street of the city.
+/// `bake` or `coordinator`, of the street of the city. `units` are the segments and the cells of a
+/// task: few, so that there is something to kill and to resume.
 #[must_use]
-pub fn bake_arguments(command: &str, scene: &Path, out: &Path) -> Vec<OsString> {
+pub fn bake_arguments(command: &str, scene: &Path, out: &Path, units: [u32; 2]) -> Vec<OsString> {
     let mut arguments: Vec<OsString> =
         vec![command.into(), scene.into(), "--out".into(), out.into()];
     arguments.extend(STREET.map(OsString::from));
+    arguments.push(format!("--segments-per-task={}", units[0]).into());
+    arguments.push(format!("--cells-per-task={}", units[1]).into());
     arguments
 }

@@ -12,7 +12,7 @@ use sightline_proto::v1::GetStatusRequest;
 use sightline_proto::v1::coordinator_client::CoordinatorClient;
 use sightline_store::{BakeStore, CellEntry, Dataset};
 use sightline_tests::binaries::{executable, sightline};
-use sightline_tests::city::{self, CELLS, City, LIMIT};
+use sightline_tests::city::{self, CELLS, City, LIMIT, TASK_UNITS};
 use sightline_tests::process::{self, Process, eventually};
 use sightline_tests::{dataset, requirement};
 use tonic::transport::Endpoint;
@@ -64,6 +64,15 @@ fn is_listening(port: u16) -> bool {
     std::net::TcpStream::connect((Ipv4Addr::LOCALHOST, port)).is_ok()
 }
 
+/// `sightline coordinator`. Its tasks are cut otherwise than those of the shared bake: the dataset
+/// must not depend on it.
+fn coordinator(dataset: &Path, listen: &str) -> Command {
+    let arguments = city::bake_arguments("coordinator", &baked().scene, dataset, [3, 1]);
+    let mut command = sightline(arguments);
+    command.args(["--listen", listen]);
+    command
+}
+
 /// The commands of one cluster.
 struct Cluster {
     folder: PathBuf,
@@ -85,8 +94,6 @@ impl Cluster {
         Self { folder, dataset, url: format!("http://127.0.0.1:{port}"), coordinator }
     }
 
-    /// `sightline coordinator`. Its tasks are cut otherwise than those of the shared bake: the
-    /// dataset must not depend on it.
     fn of_sightline(name: &str) -> Self {
         Self::start(name, |dataset, listen| {
             let mut command =
@@ -113,7 +120,7 @@ fn bake_says_what_it_did() {
 #[test]
 fn the_same_command_gives_the_same_bytes_with_one_thread() {
     let out = empty("again");
-    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out));
+    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out, TASK_UNITS));
     let _ = run(command.args(["--threads=1", "--json"])).success();
     dataset::assert_same(&baked().dataset, &out);
 }
@@ -152,13 +159,11 @@ fn a_killed_coordinator_is_replaced_by_another() {
     let cluster = Cluster::of_sightline("replaced");
     let worker = cluster.worker("worker");
     assert!(eventually(LIMIT, || dataset::commits(&cluster.dataset) >= 3), "{}", worker.stderr());
-    let Cluster { folder, dataset, url, coordinator } = cluster;
-    coordinator.kill();
+    cluster.coordinator.kill();
+    let dataset = cluster.dataset;
     let before = dataset::commits(&dataset);
-    let listen = url.trim_start_matches("http://");
-    let mut command = sightline(city::bake_arguments("coordinator", &baked().scene, &dataset));
-    command.args(["--segments-per-task=3", "--cells-per-task=1", "--listen", listen]);
-    let successor = Process::start(&mut command, &folder, "successor");
+    let mut command = coordinator(&dataset, cluster.url.trim_start_matches("http://"));
+    let successor = Process::start(&mut command, &cluster.folder, "successor");
     let _ = successor.wait(LIMIT).success();
     let _ = worker.wait(LIMIT).success();
     assert!(dataset::commits(&dataset) > before);
@@ -193,7 +198,7 @@ fn an_interrupted_bake_resumes_to_the_same_bytes() {
     let folder = empty("interrupted");
     let out = folder.join("dataset");
     let command = || {
-        let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out));
+        let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out, TASK_UNITS));
         command.args(["--threads=1", "--json"]);
         command
     };
@@ -234,7 +239,8 @@ fn an_unknown_key_is_refused_with_a_suggestion() {
     let folder = empty("unknown-key");
     let config = folder.join("bake.toml");
     std::fs::write(&config, "[solver]\nrow = 100\n").expect("a file can be written");
-    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &folder.join("out")));
+    let mut command =
+        sightline(city::bake_arguments("bake", &baked().scene, &folder.join("out"), TASK_UNITS));
     let ended = run(command.arg("--config").arg(&config)).failure(2);
     assert!(ended.stderr.contains("solver.row`"), "{}", ended.stderr);
     assert!(ended.stderr.contains("did you mean `solver.rows`"), "{}", ended.stderr);
@@ -399,6 +405,6 @@ async fn ask(url: String) -> Result<(), Box<dyn std::error::Error>> {
 fn demo_ends_with_where_to_look_next() {
     let out = empty("demo").join("demo");
     let mut command = sightline(["demo", "--triangles=30k", "--out"]);
-    let ended = run(command.arg(&out)).success();
+    let ended = process::run(command.arg(&out), 4 * LIMIT).success();
     assert!(ended.stdout.contains("sightline export"), "{}", ended.stdout);
 }

@@ -9,9 +9,8 @@
 //!    that no segment was chosen for. Rays are cast over the hierarchy: the measurement shares no
 //!    code with the solver. Where the mean or the worst error is over its target and rounds are
 //!    left, these viewpoints are suspects, and the set is measured again at fresh ones.
-//! 4. Suspects whose error is confirmed are dealt with one by one, the worst first: a line of the
-//!    cell through the viewpoint is solved, and what remains wrong is measured again. A line runs
-//!    across the whole footprint at the viewpoint's relative height; on the bilinear surface of a
+//! 4. Suspects are dealt with one by one: where the error is confirmed, a line of the cell through
+//!    the viewpoint is solved, then one across it if that was not enough. A line runs across the whole footprint at the viewpoint's relative height; on the bilinear surface of a
 //!    cell it is straight.
 //!
 //! Everything is seeded by the cell's number and the round, so the row is a function of scene and
@@ -42,16 +41,12 @@ const HELDOUT_SEED: u64 = 744_485_463_000_000;
 /// Seed of the scouts, away from those of the rounds.
 const SCOUT_SEED: u64 = HELDOUT_SEED + 1_000_000;
 
+/// A suspect is measured with this part of the rays of a held-out viewpoint: enough to tell a
+/// pocket, where whole surfaces are missing.
+const SUSPECT_SHARE: u32 = 2;
+
 /// Seed of the measurements of suspects.
 const SUSPECT_SEED: u64 = HELDOUT_SEED + 2_000_000;
-
-/// A viewpoint where something is missing.
-struct Suspect {
-    viewpoint: DVec3,
-    error: f64,
-    /// Lines solved through it.
-    lines: u32,
-}
 
 /// A cell's visible set while it grows.
 struct Sight<'a> {
@@ -80,27 +75,26 @@ impl Sight<'_> {
         found.viewpoints.iter().filter(|v| v.wrong > 0).map(|v| v.viewpoint).collect()
     }
 
-    /// Solves lines through suspects until the error at each is down to the target, or a line
-    /// along either direction did not help.
-    fn look_from(&mut self, suspects: Vec<DVec3>) {
-        let accuracy = &self.config.accuracy;
+    /// Solves lines through suspects whose error is over `tolerated`: along u, and along v if
+    /// that was not enough.
+    fn look_from(&mut self, suspects: &[DVec3], tolerated: f64) {
+        let rays = self.config.accuracy.heldout_rays.div_ceil(SUSPECT_SHARE);
         let sampling = Sampling::new(self.config.solver.rows);
-        let suspect = |viewpoint| Suspect { viewpoint, error: 0.0, lines: 0 };
-        let mut left: Vec<Suspect> = suspects.into_iter().map(suspect).collect();
-        for _ in 0..LINES_MAX {
-            let viewpoints: Vec<DVec3> = left.iter().map(|s| s.viewpoint).collect();
-            let found = self.measure(&viewpoints, accuracy.heldout_rays, SUSPECT_SEED);
-            for (suspect, found) in left.iter_mut().zip(&found.viewpoints) {
-                suspect.error = found.error;
+        let mut lines_left = LINES_MAX;
+        for &viewpoint in suspects {
+            for along_u in [true, false] {
+                if self.measure(&[viewpoint], rays, SUSPECT_SEED).max() <= tolerated {
+                    break;
+                }
+                if lines_left == 0 {
+                    return;
+                }
+                lines_left -= 1;
+                let line = line_through(self.cell, viewpoint, along_u);
+                let seen = solve_segment(self.scene, &line, sampling);
+                self.set = PrimitiveSet::union([&self.set, &seen.set]);
+                self.lines.push(seen);
             }
-            left.retain(|s| s.error > accuracy.target_error && s.lines < 2);
-            let worst = left.iter_mut().max_by(|a, b| a.error.total_cmp(&b.error));
-            let Some(worst) = worst else { break };
-            worst.lines += 1;
-            let line = line_through(self.cell, worst.viewpoint, worst.lines == 1);
-            let seen = solve_segment(self.scene, &line, sampling);
-            self.set = PrimitiveSet::union([&self.set, &seen.set]);
-            self.lines.push(seen);
         }
     }
 }
@@ -121,7 +115,7 @@ pub fn finish_cell(
     let mut sight = Sight { scene, config, cell, set, lines: Vec::new(), rays: 0 };
     if accuracy.rounds > 0 && !inside.is_empty() {
         let suspects = sight.scout();
-        sight.look_from(suspects);
+        sight.look_from(&suspects, accuracy.worst_error);
     }
     let mut rounds = 0;
     let error = loop {
@@ -133,7 +127,10 @@ pub fn finish_cell(
             break error;
         }
         rounds += 1;
-        sight.look_from(worst_first(&error));
+        // Where the mean is too large, every viewpoint over the target adds to it.
+        let mean_is_good = error.mean() <= accuracy.target_error;
+        let tolerated = if mean_is_good { accuracy.worst_error } else { accuracy.target_error };
+        sight.look_from(&worst_first(&error), tolerated);
     };
     let solved: Vec<&SegmentRow> = rows.iter().copied().chain(&sight.lines).collect();
     CellOutput {

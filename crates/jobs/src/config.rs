@@ -148,7 +148,7 @@ impl Default for AccuracyConfig {
             target_error: 0.0002,
             worst_error: 0.002,
             heldout_viewpoints: 16,
-            heldout_rays: 4000,
+            heldout_rays: 2000,
             scouts: 1024,
             scout_rays: 32,
             rounds: 4,
@@ -288,7 +288,7 @@ pub const KEYS: &[KeyDoc] = &[
     key(
         "accuracy.heldout_rays",
         "integer",
-        "4000",
+        "2000",
         "rays a viewpoint",
         "Rays that measure the error at one held-out viewpoint.",
     ),

@@ -361,6 +361,14 @@ pub enum Cause {
         /// The limit.
         limit: u64,
     },
+    /// More triangles of instances that a scale of zero flattens than are allowed.
+    #[error("a scale of zero flattens {count} triangles of instances; the limit is {limit}")]
+    TooManyFlattened {
+        /// Triangles, each flattened instance counted.
+        count: u64,
+        /// The limit.
+        limit: u64,
+    },
     /// More instances than the options allow.
     #[error("the scene has {count} instances; the limit is {limit}")]
     TooManyInstances {
@@ -501,6 +509,9 @@ impl SceneError {
             }
             Cause::PositionTooFar { .. } | Cause::TooFar { .. } => {
                 "move the scene to the world's origin; its unit is the metre".into()
+            }
+            Cause::TooManyFlattened { .. } => {
+                "give the node a small scale instead of zero, or remove its instances".into()
             }
             Cause::TransformNotFinite | Cause::MatrixNotAffine { .. } | Cause::RotationZero => {
                 "give the node a valid transform: finite numbers, a rotation of length 1".into()

@@ -18,23 +18,6 @@
 //! Parts: `source` reads raw elements; `output` collects sections, accessors and the GLB
 //! container; `subset` finds subsets and rebuilds primitives; `appearance` follows materials to images.
 
-// The reader's own decoding. Its modules are private to it, so they are compiled here once more.
-#[path = "gltf_reader/buffers.rs"]
-#[allow(dead_code, clippy::duplicate_mod)]
-mod buffers;
-#[path = "gltf_reader/container.rs"]
-#[allow(dead_code, clippy::duplicate_mod)]
-mod container;
-#[path = "gltf_reader/document.rs"]
-#[allow(dead_code, clippy::duplicate_mod)]
-mod document;
-#[path = "gltf_reader/meshopt_view.rs"]
-#[allow(dead_code, clippy::duplicate_mod)]
-mod meshopt_view;
-#[path = "gltf_reader/uri.rs"]
-#[allow(dead_code, clippy::duplicate_mod)]
-mod uri;
-
 mod appearance;
 mod hierarchy;
 mod output;
@@ -48,6 +31,7 @@ use std::path::{Path, PathBuf};
 use serde_json::{Map, Value, json};
 use sightline_geometry::PrimitiveSet;
 
+use crate::gltf_reader::{buffers, container, document, uri};
 use crate::{Scene, SceneError};
 use output::Output;
 use source::Source;

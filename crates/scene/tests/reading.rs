@@ -2,6 +2,8 @@
 
 mod fixtures;
 
+use std::f64::consts::FRAC_1_SQRT_2;
+
 use fixtures::{Fixture, assert_same_triangles, open, rounded_triangles, scenes, world_triangles};
 use serde_json::json;
 use sightline_geometry::{ObjectId, Ray, raycast::RayCaster};
@@ -19,7 +21,7 @@ fn open_with(f: &Fixture, see_through: &[&str]) -> Scene {
 fn transforms_compose_in_f64_far_from_the_origin() {
     let mut f = Fixture::square();
     f.json["nodes"][0] = json!({"translation": [1e7, 0.0, 0.1], "children": [1]});
-    f.node(json!({"rotation": [0.0, 0.7071067811865476, 0.0, 0.7071067811865476],
+    f.node(json!({"rotation": [0.0, FRAC_1_SQRT_2, 0.0, FRAC_1_SQRT_2],
         "scale": [2.0, 3.0, -1.0], "children": [2]}));
     f.node(json!({"matrix": [1.0,0.0,0.0,0.0, 0.0,1.0,0.0,0.0, 0.0,0.0,1.0,0.0, 0.0,0.0,0.25,1.0],
         "mesh": 0}));

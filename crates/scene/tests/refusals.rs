@@ -262,6 +262,17 @@ fn compressed_data_that_does_not_decode_is_refused() {
 }
 
 #[test]
+fn a_scale_of_zero_on_many_turned_instances_is_refused_before_it_is_read() {
+    let mut f = Fixture::with_triangles(&[[0.0; 3]; 3000], None);
+    let turns: Vec<[f32; 4]> = (0..2000u32).map(|i| [i as f32, 1.0, 2.0, 3.0]).collect();
+    let turns = f.floats(&turns);
+    f.json["nodes"][0]["scale"] = json!([0, 1, 1]);
+    f.json["nodes"][0]["extensions"] =
+        json!({"EXT_mesh_gpu_instancing": {"attributes": {"ROTATION": turns}}});
+    assert_refused!(f, Cause::TooManyFlattened { count: 2_000_000, .. });
+}
+
+#[test]
 fn limits_of_the_options_hold() {
     let glb = Fixture::square().glb();
     let mut options = OpenOptions::default();

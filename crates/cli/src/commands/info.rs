@@ -177,7 +177,7 @@ async fn describe_dataset(dataset: &Dataset, command: &Info) -> Result<()> {
             format!(
                 "{} ({})",
                 manifest.scene.uri,
-                &manifest.scene.hash[..16.min(manifest.scene.hash.len())]
+                manifest.scene.hash.chars().take(16).collect::<String>()
             ),
         )
         .row("objects", thousands(manifest.scene.objects));

@@ -154,7 +154,7 @@ fn expect_members(row: &CellRow, scene: &Scene) -> Result<()> {
 fn exceeded(findings: &Findings, command: &Verify) -> Vec<String> {
     let over = |name: &str, found: f64, limit: Option<f64>| {
         // A NaN limit is exceeded, too.
-        let limit = limit.filter(|limit| !(found <= *limit))?;
+        let limit = limit.filter(|limit| found > *limit || limit.is_nan())?;
         Some(format!("the {name} pixel error is {}, more than {}", percent(found), percent(limit)))
     };
     [

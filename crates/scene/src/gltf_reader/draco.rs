@@ -32,17 +32,20 @@ pub struct DracoPrimitive {
     pub attributes: BTreeMap<String, u32>,
 }
 
+/// Vertex positions, and vertex indices a triangle, not yet checked against them.
+pub struct Decoded {
+    pub positions: Vec<[f32; 3]>,
+    pub triangles: Vec<[u32; 3]>,
+}
+
 /// Decodes vertex positions and triangles. `position` is the unique id of the attribute.
-pub fn decode(source: &[u8], position: u32) -> Result<(Vec<[f32; 3]>, Vec<[u32; 3]>), SceneError> {
+pub fn decode(source: &[u8], position: u32) -> Result<Decoded, SceneError> {
     catch_unwind(AssertUnwindSafe(|| decode_unguarded(source, position)))
         .unwrap_or_else(|_| Err("the decoder failed".into()))
         .map_err(|reason| Cause::Draco { reason }.into())
 }
 
-fn decode_unguarded(
-    source: &[u8],
-    position: u32,
-) -> Result<(Vec<[f32; 3]>, Vec<[u32; 3]>), String> {
+fn decode_unguarded(source: &[u8], position: u32) -> Result<Decoded, String> {
     let bytes = (source.len() as u64 * MAX_EXPANSION).clamp(ALWAYS_ALLOWED, NEVER_ALLOWED);
     let limits = DecodeLimits::default()
         .with_max_points(bytes / 12)
@@ -61,5 +64,5 @@ fn decode_unguarded(
     let positions = attribute.read_f32s(mesh.num_points(), 3);
     let positions = positions.as_chunks::<3>().0.to_vec();
     let triangles = mesh.faces().iter().map(|f| f.map(|p| p.0)).collect();
-    Ok((positions, triangles))
+    Ok(Decoded { positions, triangles })
 }

@@ -54,7 +54,10 @@ pub fn decode(view: &MeshoptView, source: &[u8]) -> Result<Vec<u8>, String> {
     let bytes = source.len() as u64;
     let fits = match view.mode {
         Mode::Attributes => {
-            if view.byte_stride == 0 || view.byte_stride > 256 || view.byte_stride % 4 != 0 {
+            if view.byte_stride == 0
+                || view.byte_stride > 256
+                || !view.byte_stride.is_multiple_of(4)
+            {
                 return Err(format!("a stride of {} bytes is not allowed", view.byte_stride));
             }
             view.count.checked_mul(view.byte_stride).is_some_and(|n| n / MAX_EXPANSION <= bytes)
@@ -68,7 +71,9 @@ pub fn decode(view: &MeshoptView, source: &[u8]) -> Result<Vec<u8>, String> {
     let count = view.count as usize;
     match view.mode {
         Mode::Attributes => attributes(view, source, count),
-        Mode::Triangles if count % 3 != 0 => Err(format!("{count} indices are no triangles")),
+        Mode::Triangles if !count.is_multiple_of(3) => {
+            Err(format!("{count} indices are no triangles"))
+        }
         Mode::Triangles => match view.byte_stride {
             2 => bytes_of(meshopt::decode_index_buffer::<u16>(source, count), u16::to_le_bytes),
             4 => bytes_of(meshopt::decode_index_buffer::<u32>(source, count), u32::to_le_bytes),

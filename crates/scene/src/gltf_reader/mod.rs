@@ -20,15 +20,15 @@
 
 mod accessors;
 mod assemble;
-mod buffers;
-mod container;
-mod document;
+pub(crate) mod buffers;
+pub(crate) mod container;
+pub(crate) mod document;
 mod draco;
 mod gpu_instancing;
 mod meshopt_view;
 mod nodes;
 mod primitives;
-mod uri;
+pub(crate) mod uri;
 
 use std::path::Path;
 

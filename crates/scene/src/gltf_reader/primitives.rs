@@ -22,7 +22,7 @@ use super::{
     MAX_COORDINATE,
     accessors::{Accessors, INDICES, POSITIONS},
     document::{Document, extension},
-    draco::{self, DracoPrimitive},
+    draco::{self, Decoded, DracoPrimitive},
     nodes::{Placed, Warnings},
 };
 use crate::{
@@ -331,27 +331,43 @@ fn flattening(transform: &DAffine3) -> Option<[u64; 9]> {
     (!invertible).then(|| m.to_cols_array().map(f64::to_bits))
 }
 
-/// Refuses scenes that would take more memory than the options allow.
+/// Triangles in bodies of flattened instances that a scene may have. Each such instance takes
+/// memory and time of its own, so a scale of zero on a forest must not cost what a forest does.
+const MAX_FLATTENED_TRIANGLES: u64 = 1 << 20;
+
+/// Triangles that a Draco body counts for before it is decoded.
+const DRACO_GUESS: u64 = 1 << 14;
+
+/// Refuses scenes that would take more memory than is allowed.
 fn check_size(
     jobs: &[Job],
     accessors: &Accessors,
     options: &OpenOptions,
 ) -> Result<(), SceneError> {
-    let mut count = 0u64;
+    let (mut count, mut flattened) = (0u64, 0u64);
     for job in jobs {
-        // What Draco data decodes to is limited by the decoder.
-        if let Source::Plain { positions, indices, topology } = job.key.source {
-            let corners = accessors.get(indices.unwrap_or(positions), || {
-                format!("mesh {}, primitive {}", job.mesh, job.primitive)
-            })?;
-            let corners = corners.count.0;
-            let triangles = if topology == Topology::Triangles { corners / 3 } else { corners };
-            count = count.saturating_add(triangles);
+        let triangles = match job.key.source {
+            Source::Plain { positions, indices, topology } => {
+                let corners = accessors.get(indices.unwrap_or(positions), || {
+                    format!("mesh {}, primitive {}", job.mesh, job.primitive)
+                })?;
+                let corners = corners.count.0;
+                if topology == Topology::Triangles { corners / 3 } else { corners }
+            }
+            Source::Draco { .. } => DRACO_GUESS,
+        };
+        count = count.saturating_add(triangles);
+        if job.key.flatten.is_some() {
+            flattened = flattened.saturating_add(triangles);
         }
     }
     let limit = options.max_unique_triangles;
     if count > limit {
         return Err(Cause::TooManyUniqueTriangles { count, limit }.into());
+    }
+    let limit = MAX_FLATTENED_TRIANGLES;
+    if flattened > limit {
+        return Err(Cause::TooManyFlattened { count: flattened, limit }.into());
     }
     Ok(())
 }
@@ -374,7 +390,7 @@ fn read(job: &Job, accessors: &Accessors) -> Result<Read, SceneError> {
         }
         Source::Draco { view, position } => {
             let view = accessors.view(view, || draco::NAME.into())?;
-            let (positions, triangles) = draco::decode(view.bytes, position)?;
+            let Decoded { positions, triangles } = draco::decode(view.bytes, position)?;
             let vertices = positions.len();
             let outside = |&v: &u32| v as usize >= vertices;
             if let Some(at) = triangles.as_flattened().iter().position(outside) {
@@ -470,7 +486,7 @@ fn corners(
         Topology::Fan => (0..strips).map(|i| [at(i + 1), at(i + 2), at(0)]).collect(),
     };
     let odd = match topology {
-        Topology::Triangles => count % 3 != 0,
+        Topology::Triangles => !count.is_multiple_of(3),
         Topology::Strip | Topology::Fan => count > 0 && count < 3,
     };
     Ok(Corners { triangles, odd })
