@@ -95,12 +95,7 @@ impl Cluster {
     }
 
     fn of_sightline(name: &str) -> Self {
-        Self::start(name, |dataset, listen| {
-            let mut command =
-                sightline(city::bake_arguments("coordinator", &baked().scene, dataset));
-            command.args(["--segments-per-task=3", "--cells-per-task=1", "--listen", listen]);
-            command
-        })
+        Self::start(name, coordinator)
     }
 
     fn worker(&self, name: &str) -> Process {

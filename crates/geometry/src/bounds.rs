@@ -95,10 +95,8 @@ impl Bounds32 {
     pub fn of_points(points: impl IntoIterator<Item = [f32; 3]>) -> Self {
         let mut b = Self { min: [f32::INFINITY; 3], max: [f32::NEG_INFINITY; 3] };
         for p in points {
-            for k in 0..3 {
-                b.min[k] = b.min[k].min(p[k]);
-                b.max[k] = b.max[k].max(p[k]);
-            }
+            b.min = std::array::from_fn(|k| b.min[k].min(p[k]));
+            b.max = std::array::from_fn(|k| b.max[k].max(p[k]));
         }
         b
     }

@@ -31,7 +31,8 @@ pub fn reaches_into(cell: &ViewCell, corners: [DVec3; 3]) -> bool {
     let mut polygon = corners.to_vec();
     // Either orientation of the footprint: the signed area tells which side is inside.
     let c = cell.corners;
-    let cross = |a: DVec3, b: DVec3, p: DVec3| (b.x - a.x) * (p.z - a.z) - (b.z - a.z) * (p.x - a.x);
+    let cross =
+        |a: DVec3, b: DVec3, p: DVec3| (b.x - a.x) * (p.z - a.z) - (b.z - a.z) * (p.x - a.x);
     let turn = (cross(c[0], c[1], c[2]) + cross(c[0], c[2], c[3])).signum();
     for k in 0..4 {
         let (a, b) = (c[k], c[(k + 1) % 4]);
@@ -108,11 +109,16 @@ mod tests {
         assert!(reaches_into(&cell(), inside));
         assert!(!reaches_into(&cell(), below));
         assert!(!reaches_into(&cell(), above));
-        let through = [DVec3::new(1.0, -9.0, 1.0), DVec3::new(1.0, 9.0, 1.0), DVec3::new(1.0, 9.0, 1.5)];
+        let through =
+            [DVec3::new(1.0, -9.0, 1.0), DVec3::new(1.0, 9.0, 1.0), DVec3::new(1.0, 9.0, 1.5)];
         assert!(reaches_into(&cell(), through));
         let on_the_side = through.map(|p| DVec3::new(0.0, p.y, p.z));
         assert!(!reaches_into(&cell(), on_the_side));
-        let large = [DVec3::new(-99.0, 1.6, -99.0), DVec3::new(99.0, 1.6, -99.0), DVec3::new(0.0, 1.6, 99.0)];
+        let large = [
+            DVec3::new(-99.0, 1.6, -99.0),
+            DVec3::new(99.0, 1.6, -99.0),
+            DVec3::new(0.0, 1.6, 99.0),
+        ];
         assert!(reaches_into(&cell(), large));
     }
 }

@@ -11,8 +11,8 @@ pub mod export;
 pub mod generate;
 mod gltf_reader;
 mod numbering;
-mod report;
 pub mod region;
+mod report;
 mod scene;
 
 pub use digest::{FileDigest, SceneDigest, digest};

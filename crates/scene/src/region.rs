@@ -92,7 +92,9 @@ pub enum RegionError {
         rule: &'static str,
     },
     /// Too many squares.
-    #[error("the region needs {squares:.0} cells of {cell_size} m: use larger cells or a smaller region")]
+    #[error(
+        "the region needs {squares:.0} cells of {cell_size} m: use larger cells or a smaller region"
+    )]
     TooManyCells {
         /// Squares in the region's bounding box.
         squares: f64,
@@ -108,7 +110,9 @@ pub enum RegionError {
         message: String,
     },
     /// No object is called ground.
-    #[error("no object's name matches the ground patterns {patterns:?}; `sightline info` lists names")]
+    #[error(
+        "no object's name matches the ground patterns {patterns:?}; `sightline info` lists names"
+    )]
     NoGround {
         /// The patterns.
         patterns: Vec<String>,
@@ -157,9 +161,8 @@ fn meets(polygon: &[[f64; 2]], low: [f64; 2], high: [f64; 2]) -> bool {
 }
 
 fn shapes(spec: &RegionSpec) -> Result<Vec<Polygon>, RegionError> {
-    let bad_number = |key, value: f64, rule| {
-        Err(RegionError::BadNumber { key, value: value.to_string(), rule })
-    };
+    let bad_number =
+        |key, value: f64, rule| Err(RegionError::BadNumber { key, value: value.to_string(), rule });
     if !(spec.cell_size > 0.0 && spec.cell_size.is_finite()) {
         return bad_number("region.cell_size", spec.cell_size, "must be greater than 0 metres");
     }
@@ -312,8 +315,10 @@ pub fn tile(scene: &Scene, spec: &RegionSpec) -> Result<TiledRegion, RegionError
         Heights::Absolute => None,
         Heights::AboveGround { from, ground } => Some(Ground::new(scene, *from, ground)?),
     };
-    let mut nodes: Vec<[u32; 2]> =
-        squares.iter().flat_map(|&[i, j]| [[i, j], [i + 1, j], [i + 1, j + 1], [i, j + 1]]).collect();
+    let mut nodes: Vec<[u32; 2]> = squares
+        .iter()
+        .flat_map(|&[i, j]| [[i, j], [i + 1, j], [i + 1, j + 1], [i, j + 1]])
+        .collect();
     nodes.sort_unstable();
     nodes.dedup();
     let eyes: HashMap<[u32; 2], Option<DVec3>> = nodes
