@@ -155,6 +155,14 @@ fn libraries_do_not_print() {
 }
 
 #[test]
+fn libraries_do_not_end_the_process() {
+    // The command may: a second Ctrl-C does not wait for what is in flight.
+    let lines = product(|f| !f.starts_with("crates/cli") && !f.ends_with("main.rs"));
+    let found = sources::lines_with(&lines, &["process::exit", "process::abort"]);
+    assert!(found.is_empty(), "{found:#?}");
+}
+
+#[test]
 fn kernels_and_scheduling_have_no_clock_no_io_and_no_randomness() {
     let lines = product(|f| PURE.iter().any(|p| f.starts_with(format!("crates/{p}"))));
     let clocks = ["SystemTime", "Instant", "std::thread"];
