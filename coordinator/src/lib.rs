@@ -1,6 +1,6 @@
 //! The coordinator: plans a bake, leases its tasks to workers, publishes the dataset.
 //!
-//! - [`prepare`]: from a scene file and a configuration to a plan.
+//! - [`prepare()`]: from a scene file and a configuration to a plan.
 //! - [`Coordinator`]: runs a plan to its end, over gRPC.
 //! - [`journal`]: what is in the store, who may write it, and what a crash leaves behind.
 //! - [`dataset`]: from committed parts to a published dataset.

@@ -141,9 +141,9 @@ impl Sampling {
         let corner = |c: f64, w: f64| {
             // atan(c w / sqrt(1 + c^2 + w^2)), with its limit for c = +-inf.
             if c.is_infinite() {
-                (c.signum() * w).atan()
+                libm::atan(c.signum() * w)
             } else {
-                (c * w / (1.0 + c * c + w * w).sqrt()).atan()
+                libm::atan(c * w / (1.0 + c * c + w * w).sqrt())
             }
         };
         corner(c1, w1) - corner(c0, w1) - corner(c1, w0) + corner(c0, w0)

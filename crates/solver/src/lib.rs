@@ -7,7 +7,7 @@
 //! rectified frame whose image rows are epipolar planes ([`sightline_geometry::RectifiedFrame`]):
 //! a row is a problem in a plane, a triangle cuts it in one line segment (a [`cut::Cut`]), a pixel
 //! is the lower envelope of line segments in (t, z) ([`envelope`]), and a hierarchy is walked
-//! front to back against what has been found ([`tile`]).
+//! front to back against what has been found (`tile`).
 //!
 //! Guarantees:
 //! - VI-1: a pixel's intervals are sorted and disjoint.
@@ -17,7 +17,7 @@
 //! - An interval counts only when it is longer than the derived bound on the error of its ends
 //!   ([`bounds`]), so rounding never makes a primitive visible.
 //!
-//! [`reference`] solves the same definition in exact rational arithmetic, with no culling and no
+//! [`mod@reference`] solves the same definition in exact rational arithmetic, with no culling and no
 //! floats; the tests compare the two.
 
 pub mod bounds;

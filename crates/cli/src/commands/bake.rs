@@ -210,7 +210,6 @@ fn standing(status: &BakeStatus) -> String {
 }
 
 /// Until Ctrl-C or SIGTERM. The second one ends the process at once.
-#[expect(clippy::disallowed_methods, reason = "whoever asks twice does not want to wait")]
 pub async fn stop_signal() {
     let first = next_signal().await;
     if first {
