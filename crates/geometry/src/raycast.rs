@@ -34,7 +34,8 @@ pub struct Hit {
     pub primitive: PrimitiveId,
     /// Its instance.
     pub instance: InstanceId,
-    /// True when the side is met from which the corners go counter-clockwise (the glTF front).
+    /// True when the glTF front is met: the side from which the corners go counter-clockwise in
+    /// mesh space. Mirrored instances keep their front, as glTF has it.
     pub front: bool,
 }
 
@@ -186,7 +187,7 @@ impl RayCaster {
                 let instance = &geometry.instances[id.index()];
                 let mesh = &geometry.meshes[instance.mesh.index()];
                 // The affine inverse keeps distances: they are in units of the direction.
-                let Placement { mesh_from_world, mirrored } = geometry.placement(id);
+                let Placement { mesh_from_world } = geometry.placement(id);
                 let local = Sheared::new(Ray {
                     origin: mesh_from_world.transform_point3(ray.origin),
                     direction: mesh_from_world.transform_vector3(ray.direction),
@@ -198,7 +199,6 @@ impl RayCaster {
                         };
                         let primitive = PrimitiveId(instance.first_primitive.0 + t as u32);
                         if distance <= limit && accept(primitive) {
-                            let front = front != mirrored;
                             let hit = Hit { distance, primitive, instance: id, front };
                             limit = visit(hit, limit);
                         }

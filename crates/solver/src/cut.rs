@@ -41,10 +41,12 @@ fn edge(p: DVec3, q: DVec3, hp: f64, hq: f64) -> (f64, f64) {
 
 impl Cut {
     /// The cut of row `w` through the triangle with these face coordinates, if there is one in
-    /// front of the camera.
+    /// front of the camera. `on_axis` is the largest rounding error of a face coordinate, metres:
+    /// a cut no deeper than that lies on the axis. A triangle whose plane holds the segment has
+    /// such cuts; seen edge-on from everywhere, it hides nothing.
     #[inline]
     #[must_use]
-    pub fn of_triangle(corners: &[DVec3; 3], w: f64, primitive: u32) -> Option<Self> {
+    pub fn of_triangle(corners: &[DVec3; 3], w: f64, on_axis: f64, primitive: u32) -> Option<Self> {
         let h = corners.map(|p| p.y - w * p.z);
         let above = h.map(|h| h >= 0.0);
         // The corner that is alone on its side.
@@ -57,6 +59,9 @@ impl Cut {
         let (i, j) = ((k + 1) % 3, (k + 2) % 3);
         let (xa, za) = edge(corners[k], corners[i], h[k], h[i]);
         let (xb, zb) = edge(corners[k], corners[j], h[k], h[j]);
+        if za.max(zb) <= on_axis {
+            return None;
+        }
         Self { xa, za, xb, zb, primitive }.clipped()
     }
 
@@ -102,7 +107,7 @@ mod tests {
         ) {
             let side = |v: DVec3| v.y - w * v.z >= 0.0;
             prop_assume!(side(p) != side(q));
-            let ends = |t: [DVec3; 3]| Cut::of_triangle(&t, w, 0)
+            let ends = |t: [DVec3; 3]| Cut::of_triangle(&t, w, 0.0, 0)
                 .map(|c| [(c.xa.to_bits(), c.za.to_bits()), (c.xb.to_bits(), c.zb.to_bits())]);
             let shared = edge(p, q, p.y - w * p.z, q.y - w * q.z);
             let bits = (shared.0.to_bits(), shared.1.to_bits());
@@ -120,9 +125,12 @@ mod tests {
         let on = DVec3::new(0.0, 0.0, 1.0);
         let (up, down) = (DVec3::new(1.0, 1.0, 1.0), DVec3::new(1.0, -1.0, 1.0));
         let aside = DVec3::new(2.0, 1.0, 1.0);
-        assert!(Cut::of_triangle(&[on, up, aside], 0.0, 0).is_none());
-        assert!(Cut::of_triangle(&[on, up, down], 0.0, 0).is_some());
+        assert!(Cut::of_triangle(&[on, up, aside], 0.0, 0.0, 0).is_none());
+        assert!(Cut::of_triangle(&[on, up, down], 0.0, 0.0, 0).is_some());
         let flat = [on, DVec3::new(1.0, 0.0, 1.0), DVec3::new(0.0, 0.0, 2.0)];
-        assert!(Cut::of_triangle(&flat, 0.0, 0).is_none(), "a triangle in the plane has no cut");
+        assert!(
+            Cut::of_triangle(&flat, 0.0, 0.0, 0).is_none(),
+            "a triangle in the plane has no cut"
+        );
     }
 }

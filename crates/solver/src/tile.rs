@@ -332,7 +332,8 @@ impl TileSolver {
             }
             let primitive = instance.first_primitive.0 + item as u32;
             for row in 0..self.rows.len() {
-                if let Some(cut) = Cut::of_triangle(&corners, self.rows[row], primitive) {
+                let on_axis = context.bounds.depth;
+                if let Some(cut) = Cut::of_triangle(&corners, self.rows[row], on_axis, primitive) {
                     self.counters.cuts += 1;
                     self.row_cut(context, row, cut, pass);
                 }
