@@ -8,6 +8,12 @@ use sightline_geometry::{
 };
 use sightline_solver::{bounds::ErrorBounds, reference, solve_segment};
 
+/// The same cases each time: a change is judged by what it changes.
+fn short_form() -> ProptestConfig {
+    let rng_seed = proptest::test_runner::RngSeed::Fixed(20_261_122);
+    ProptestConfig { cases: 48, rng_seed, failure_persistence: None, ..ProptestConfig::default() }
+}
+
 /// One instance a mesh, every second one mirrored and rotated when `transform` is set.
 fn geometry(meshes: Vec<(Vec<[f32; 3]>, bool)>, offset: DVec3) -> InstancedGeometry {
     let mut next = 0;
@@ -110,7 +116,7 @@ fn soup(
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(48))]
+    #![proptest_config(short_form())]
 
     #[test]
     fn random_soups_agree_with_the_exact_twin(
@@ -247,7 +253,7 @@ fn threads_do_not_change_the_result() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(48))]
+    #![proptest_config(short_form())]
 
     #[test]
     fn degenerate_soups_agree_with_the_exact_twin(
