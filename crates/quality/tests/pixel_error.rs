@@ -186,7 +186,7 @@ fn results_depend_on_the_seed_and_not_on_threads() {
     assert_eq!(one.viewpoints[2].seed, viewpoint_seed(11, CellId(7), 2));
 }
 
-const PINNED: [u32; 5] = [1398, 1039, 1005, 967, 998];
+const PINNED: [u32; 5] = [1265, 1028, 1095, 950, 1029];
 
 #[test]
 fn viewpoints_fill_the_cell() {

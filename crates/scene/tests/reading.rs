@@ -417,7 +417,7 @@ fn the_hospital_and_its_gpu_instanced_twin_hold_the_same_triangles() {
 /// hierarchy builder can order by.
 #[test]
 fn geometry_that_cannot_be_sorted_is_read_in_time() {
-    let many = 500u32;
+    let many = 20_000u32;
     let mut times = Vec::new();
     let mut timed = |what: &str, f: &Fixture| {
         let began = std::time::Instant::now();

@@ -43,21 +43,28 @@ fn segment(v0: DVec3, v1: DVec3) -> ViewSegment {
     ViewSegment { id: SegmentId(0), v0, v1 }
 }
 
-/// True when rounding decides on which side of some row plane a vertex lies. An edge in the plane
-/// is then cut along its whole length or not at all, both rightly: closed meshes stay closed,
-/// since all triangles of the edge decide alike, but single triangles come and go.
+/// True when rounding decides on which side of some row plane a vertex lies, or whether a triangle
+/// is edge-on. An edge in the plane is then cut along its whole length or not at all, both rightly:
+/// closed meshes stay closed, since all triangles of the edge decide alike, but single triangles
+/// come and go.
 fn rounding_decides(scene: &InstancedGeometry, seg: &ViewSegment, sampling: Sampling) -> bool {
     let frame = RectifiedFrame::new(seg).unwrap();
     let bound = 2.0 * ErrorBounds::new(scene.bounds, &frame).depth;
     let corners = (0..scene.primitive_count()).flat_map(|p| scene.triangle(PrimitiveId(p)).corners);
     let points: Vec<DVec3> = corners.map(|c| c - seg.v0).filter(|&p| p != DVec3::ZERO).collect();
-    // A triangle whose plane holds the segment is edge-on from everywhere: rounding of the
-    // frame alone decides whether it is seen.
+    // A triangle whose plane holds the segment is edge-on from everywhere: rounding of the frame
+    // alone decides whether it is seen. `volume` is a product of three differences of points; with
+    // points displaced by `bound` each factor changes by up to twice that.
     let edge_on = (0..scene.primitive_count()).any(|p| {
         let [a, b, c] = scene.triangle(PrimitiveId(p)).corners;
-        let normal = (b - a).cross(c - a);
-        let off = |v: DVec3| normal.dot(v - a).abs() <= 4.0 * bound * (1.0 + normal.length());
-        off(seg.v0) && off(seg.v1)
+        let (e, f) = (b - a, c - a);
+        let in_plane = |v: DVec3| {
+            let d = v - a;
+            let volume = e.cross(f).dot(d);
+            let [le, lf, ld] = [e, f, d].map(DVec3::length);
+            volume.abs() <= 2.0 * bound * (le * lf + lf * ld + ld * le)
+        };
+        e.cross(f) != DVec3::ZERO && in_plane(seg.v0) && in_plane(seg.v1)
     });
     edge_on
         || (0..FACE_COUNT).any(|face| {
