@@ -117,7 +117,9 @@ pub fn solve_segment(
 }
 
 impl TileCounters {
-    fn plus(self, other: Self) -> Self {
+    /// Sums of two.
+    #[must_use]
+    pub fn plus(self, other: Self) -> Self {
         Self {
             nodes: self.nodes + other.nodes,
             triangles: self.triangles + other.triangles,

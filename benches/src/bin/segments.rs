@@ -1,0 +1,67 @@
+//! Times the solves of the segments around a rectangle.
+//!
+//! ```sh
+//! cargo run --release -p sightline-benches --bin segments -- SCENE --region=-60,20,40,120 --y 5 --length 10 --rows 104
+//! ```
+#![allow(clippy::print_stdout)]
+
+use std::{path::PathBuf, time::Instant};
+
+use clap::Parser;
+use glam::DVec3;
+use sightline_geometry::{PrimitiveSet, Sampling, SegmentId, ViewSegment};
+use sightline_scene::{OpenOptions, Scene};
+use sightline_solver::Statistics;
+
+#[derive(Parser)]
+struct Arguments {
+    /// The scene, glTF.
+    scene: PathBuf,
+    /// x0,z0,x1,z1 of the rectangle, metres.
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
+    region: Vec<f64>,
+    /// Height of the perimeter, metres.
+    #[arg(long, allow_hyphen_values = true)]
+    y: f64,
+    /// Length of the pieces that the sides are cut into, metres.
+    #[arg(long, default_value_t = 10.0)]
+    length: f64,
+    /// Rows a face.
+    #[arg(long, default_value_t = 104)]
+    rows: u32,
+}
+
+fn perimeter(region: &[f64], y: f64, length: f64) -> Vec<ViewSegment> {
+    let [x0, z0, x1, z1] = region else { panic!("--region x0,z0,x1,z1") };
+    let corners = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)].map(|(x, z)| DVec3::new(*x, y, *z));
+    let mut out = Vec::new();
+    for k in 0..4 {
+        let (a, b) = (corners[k], corners[(k + 1) % 4]);
+        let pieces = ((b - a).length() / length).ceil().max(1.0) as u32;
+        for i in 0..pieces {
+            let at = |i: u32| a.lerp(b, f64::from(i) / f64::from(pieces));
+            out.push(ViewSegment { id: SegmentId(out.len() as u32), v0: at(i), v1: at(i + 1) });
+        }
+    }
+    out
+}
+
+fn main() {
+    let arguments = Arguments::parse();
+    let scene = Scene::open(&arguments.scene, &OpenOptions::default()).expect("a readable scene");
+    let segments = perimeter(&arguments.region, arguments.y, arguments.length);
+    let sampling = Sampling::new(arguments.rows);
+    let began = Instant::now();
+    let mut total = Statistics::default();
+    let mut sets = Vec::new();
+    for segment in &segments {
+        let found = sightline_solver::solve_segment(&scene.geometry, segment, sampling);
+        total = total.plus(found.statistics);
+        sets.push(found.set);
+    }
+    let seconds = began.elapsed().as_secs_f64();
+    let n = segments.len() as f64;
+    let all = PrimitiveSet::union(&sets);
+    println!("segments {n}, {:.2} ms each, {} of {} visible", 1e3 * seconds / n, all.len(), scene.geometry.primitive_count());
+    println!("a segment: {:?}", total);
+}
