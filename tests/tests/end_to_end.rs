@@ -170,7 +170,7 @@ fn thin_binaries_write_the_bytes_of_bake() {
     let config = baked().folder.join("bake.toml");
     let text = "\
         [region]\nrectangles = [[-5.0, -10.0, 5.0, 10.0]]\ncell_size = 5.0\n\
-        [solver]\nrows = 64\n\
+        [solver]\nrows = 92\n\
         [accuracy]\nheldout_viewpoints = 8\nheldout_rays = 2000\ntarget_error = 0.0001\n\
         worst_error = 0.001\nrounds = 3\n";
     std::fs::write(&config, text).expect("the configuration can be written");

@@ -35,7 +35,7 @@ const WARD: [&str; 5] = [
     "--cell-size=2",
     "--heights=absolute",
     "--eye-height=1.5,1.8",
-    "--rows=64",
+    "--rows=92",
 ];
 
 /// Bakes are large; one at a time keeps memory and time predictable.
@@ -80,7 +80,7 @@ fn assert_promise((out, summary): &(PathBuf, Value), cells: f64) {
 fn a_street_of_linz_keeps_its_promise() {
     let test = "a_street_of_linz_keeps_its_promise";
     let Some(scene) = scenes::shared(test, LINZ) else { return };
-    let flags = ["--region=-40,-40,-10,-10", "--ground=ground_derived*", "--rows=64"];
+    let flags = ["--region=-40,-40,-10,-10", "--ground=ground_derived*", "--rows=92"];
     alone(|| assert_promise(&bake("linz", &scene, &flags), 9.0));
 }
 
@@ -88,7 +88,7 @@ fn a_street_of_linz_keeps_its_promise() {
 fn rotterdam_without_ground_keeps_its_promise() {
     let test = "rotterdam_without_ground_keeps_its_promise";
     let Some(scene) = scenes::shared(test, ROTTERDAM) else { return };
-    let flags = ["--region=-40,-40,-10,-10", "--heights=absolute", "--rows=100"];
+    let flags = ["--region=-40,-40,-10,-10", "--heights=absolute", "--rows=142"];
     alone(|| {
         let baked = bake("rotterdam", &scene, &flags);
         assert_promise(&baked, 8.0);
@@ -107,7 +107,7 @@ fn a_hospital_ward_keeps_its_promise() {
 fn a_game_level_keeps_its_promise() {
     let test = "a_game_level_keeps_its_promise";
     let Some(scene) = scenes::shared(test, QUAKE) else { return };
-    let flags = ["--region=0,-5,10,0", "--cell-size=2.5", "--ground-from=6", "--rows=64"];
+    let flags = ["--region=0,-5,10,0", "--cell-size=2.5", "--ground-from=6", "--rows=92"];
     alone(|| assert_promise(&bake("quake", &scene, &flags), 8.0));
 }
 

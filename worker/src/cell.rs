@@ -7,11 +7,13 @@
 //!    with few rays each, look for them; one wrong ray makes a scout a suspect.
 //! 3. The error of the set is measured with rays from *held-out* viewpoints, random in the cell,
 //!    that no segment was chosen for. Rays are cast over the hierarchy: the measurement shares no
-//!    code with the solver. Where the mean or the worst error is over its target and rounds are
-//!    left, these viewpoints are suspects, and the set is measured again at fresh ones.
+//!    code with the solver. Where the worst error is over its target, or the mean is not below it
+//!    with 95 % confidence, and rounds are left, these viewpoints are suspects, and the set is
+//!    measured again at fresh ones.
 //! 4. Suspects are dealt with one by one: where the error is confirmed, a line of the cell through
-//!    the viewpoint is solved, then one across it if that was not enough. A line runs across the whole footprint at the viewpoint's relative height; on the bilinear surface of a
-//!    cell it is straight.
+//!    the viewpoint is solved, then one across it if that was not enough. A line runs across the
+//!    whole footprint at the viewpoint's relative height; on the bilinear surface of a cell it is
+//!    straight.
 //!
 //! Everything is seeded by the cell's number and the round, so the row is a function of scene and
 //! configuration alone.
@@ -122,13 +124,13 @@ pub fn finish_cell(
         let seed = HELDOUT_SEED + u64::from(rounds);
         let heldout = random_viewpoints(cell, accuracy.heldout_viewpoints, seed);
         let error = sight.measure(&heldout, accuracy.heldout_rays, seed);
-        let good = error.mean() <= accuracy.target_error && error.max() <= accuracy.worst_error;
+        let mean_is_good = error.mean_upper_bound() <= accuracy.target_error;
+        let good = mean_is_good && error.max() <= accuracy.worst_error;
         if good || rounds >= accuracy.rounds {
             break error;
         }
         rounds += 1;
         // Where the mean is too large, every viewpoint over the target adds to it.
-        let mean_is_good = error.mean() <= accuracy.target_error;
         let tolerated = if mean_is_good { accuracy.worst_error } else { accuracy.target_error };
         sight.look_from(&worst_first(&error), tolerated);
     };

@@ -10,6 +10,7 @@ use std::{path::PathBuf, time::Instant};
 use clap::Parser;
 use glam::DVec3;
 use sightline_geometry::{PrimitiveSet, Sampling, SegmentId, ViewSegment};
+use sightline_quality::measure_viewpoint;
 use sightline_scene::{OpenOptions, Scene};
 use sightline_solver::Statistics;
 
@@ -26,9 +27,18 @@ struct Arguments {
     /// Length of the pieces that the sides are cut into, metres.
     #[arg(long, default_value_t = 10.0)]
     length: f64,
+    /// Random viewpoints a segment, at which the error of its set is measured.
+    #[arg(long, default_value_t = 0)]
+    viewpoints: u32,
+    /// Rays a viewpoint.
+    #[arg(long, default_value_t = 100_000)]
+    rays: u32,
     /// Rows a face.
     #[arg(long, default_value_t = 104)]
     rows: u32,
+    /// Columns a face; as many as rows when absent.
+    #[arg(long)]
+    columns: Option<u32>,
 }
 
 fn perimeter(region: &[f64], y: f64, length: f64) -> Vec<ViewSegment> {
@@ -50,7 +60,8 @@ fn main() {
     let arguments = Arguments::parse();
     let scene = Scene::open(&arguments.scene, &OpenOptions::default()).expect("a readable scene");
     let segments = perimeter(&arguments.region, arguments.y, arguments.length);
-    let sampling = Sampling::new(arguments.rows);
+    let rows = arguments.rows;
+    let sampling = Sampling::with_columns(rows, arguments.columns.unwrap_or(rows));
     let began = Instant::now();
     let mut total = Statistics::default();
     let mut sets = Vec::new();
@@ -62,6 +73,27 @@ fn main() {
     let seconds = began.elapsed().as_secs_f64();
     let n = segments.len() as f64;
     let all = PrimitiveSet::union(&sets);
-    println!("segments {n}, {:.2} ms each, {} of {} visible", 1e3 * seconds / n, all.len(), scene.geometry.primitive_count());
-    println!("a segment: {:?}", total);
+    println!(
+        "segments {n}, {:.2} ms each, {} of {} visible",
+        1e3 * seconds / n,
+        all.len(),
+        scene.geometry.primitive_count()
+    );
+    println!("in all: {total:?}");
+    if arguments.viewpoints > 0 {
+        let (mut sum, mut worst) = (0.0, 0.0f64);
+        for (segment, set) in segments.iter().zip(&sets) {
+            for k in 0..arguments.viewpoints {
+                // Fractions of the golden ratio spread evenly.
+                let t = (f64::from(k + 1) * 0.618_033_988_749_895).fract();
+                let at = segment.v0.lerp(segment.v1, t);
+                let error =
+                    measure_viewpoint(&scene.geometry, set, at, arguments.rays, u64::from(k));
+                sum += error.error;
+                worst = worst.max(error.error);
+            }
+        }
+        let mean = sum / (n * f64::from(arguments.viewpoints));
+        println!("pixel error: mean {:.5} %, worst {:.5} %", 100.0 * mean, 100.0 * worst);
+    }
 }

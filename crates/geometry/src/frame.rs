@@ -86,17 +86,31 @@ impl RectifiedFrame {
     }
 }
 
-/// The pixel grid of a face: N rows and 2 N columns, sampled at pixel centres.
+/// The pixel grid of a face, sampled at pixel centres.
+///
+/// Rows and columns are not alike. What lies between two rows is not seen from anywhere on the
+/// segment. What lies between two columns may be: while the viewpoint moves by L, a column sweeps
+/// over L metres of its row's plane. So columns are half as dense as rows; docs/adr/0007 has the
+/// measurements.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sampling {
     rows: u32,
+    columns: u32,
 }
 
 impl Sampling {
-    /// N rows and 2 N columns a face; N is rounded up to a multiple of 4, at least 4.
+    /// `rows` rows and as many columns a face. Columns cover twice the angle of rows.
     #[must_use]
     pub fn new(rows: u32) -> Self {
-        Self { rows: rows.max(4).next_multiple_of(4) }
+        Self::with_columns(rows, rows)
+    }
+
+    /// `rows` rows and `columns` columns a face; both are rounded up to a multiple of 4, at least
+    /// 4.
+    #[must_use]
+    pub fn with_columns(rows: u32, columns: u32) -> Self {
+        let round = |n: u32| n.max(4).next_multiple_of(4);
+        Self { rows: round(rows), columns: round(columns) }
     }
 
     /// Number of rows a face, N.
@@ -105,10 +119,10 @@ impl Sampling {
         self.rows
     }
 
-    /// Number of columns a face, 2 N.
+    /// Number of columns a face, M.
     #[must_use]
     pub const fn columns(&self) -> u32 {
-        2 * self.rows
+        self.columns
     }
 
     /// The row coordinate w at pixel coordinate `i` in [0, N]: pixel centres are at `k + 0.5`,
@@ -118,19 +132,19 @@ impl Sampling {
         2.0 * i / f64::from(self.rows) - 1.0
     }
 
-    /// The column coordinate c at pixel coordinate `j` in [0, 2 N], ascending from -inf to
-    /// +inf: N/2 columns of c = 1/k on either side, N columns of uniform c between.
+    /// The column coordinate c at pixel coordinate `j` in [0, M], ascending from -inf to +inf:
+    /// M/4 columns of c = 1/k on either side, M/2 columns of uniform c between.
     #[must_use]
     pub fn c(&self, j: f64) -> f64 {
-        let n = f64::from(self.rows);
-        let quarter = n / 2.0;
+        let m = f64::from(self.columns);
+        let quarter = m / 4.0;
         if j < quarter {
             // k runs from 0 (c = -inf) to 1 (c = -1).
             -(quarter / j)
-        } else if j <= quarter + n {
-            2.0 * (j - quarter) / n - 1.0
+        } else if j <= m - quarter {
+            (j - quarter) / quarter - 1.0
         } else {
-            quarter / (2.0 * n - j)
+            quarter / (m - j)
         }
     }
 
@@ -189,7 +203,7 @@ mod tests {
 
     #[test]
     fn columns_ascend_over_the_whole_line() {
-        let s = Sampling::new(10);
+        let s = Sampling::with_columns(10, 22);
         assert_eq!((s.rows(), s.columns()), (12, 24));
         let c: Vec<f64> = (0..=24).map(|j| s.c(f64::from(j))).collect();
         assert!(c.windows(2).all(|w| w[0] < w[1]));

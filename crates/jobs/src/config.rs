@@ -79,7 +79,7 @@ impl fmt::Display for Heights {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SolverConfig {
-    /// Rows of a face of the rectified frame; a face has twice as many columns.
+    /// Rows of a face of the rectified frame; a face has as many columns.
     pub rows: u32,
     /// Horizontal perimeters of a cell that are solved, from the lower to the upper eye height.
     pub rings: u32,
@@ -91,7 +91,7 @@ pub struct SolverConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct AccuracyConfig {
-    /// Mean pixel error of a cell that is aimed at, share of pixels.
+    /// Mean pixel error of a cell that is aimed at, share of pixels, with 95 % confidence.
     pub target_error: f64,
     /// Pixel error aimed at for the worst held-out viewpoint of a cell, share of pixels.
     pub worst_error: f64,
@@ -246,7 +246,7 @@ pub const KEYS: &[KeyDoc] = &[
         "integer",
         "200",
         "rows a face",
-        "Rows of a face of the image; a face has twice as many columns. \
+        "Rows of a face of the image; a face has as many columns. \
          More rows find smaller primitives and cost more time.",
     ),
     key(
@@ -269,7 +269,8 @@ pub const KEYS: &[KeyDoc] = &[
         "number",
         "0.0002",
         "share of pixels",
-        "Mean pixel error of a cell that refinement aims at.",
+        "Mean pixel error of a cell that refinement aims at. A cell is refined until held-out \
+         viewpoints say with 95 % confidence that it is met, or accuracy.rounds are used up.",
     ),
     key(
         "accuracy.worst_error",

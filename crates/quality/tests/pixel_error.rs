@@ -5,7 +5,9 @@ use sightline_geometry::{
     CellId, Instance, InstancedGeometry, Mesh, MeshId, ObjectId, PrimitiveId, PrimitiveSet,
     ViewCell,
 };
-use sightline_quality::{measure_cell, measure_viewpoint, random_viewpoints, viewpoint_seed};
+use sightline_quality::{
+    CellError, ViewpointError, measure_cell, measure_viewpoint, random_viewpoints, viewpoint_seed,
+};
 
 const RAYS: u32 = 200_000;
 
@@ -205,4 +207,27 @@ fn many_rays_are_taken_in_batches() {
     let error = measure_viewpoint(&scene, &set, DVec3::ZERO, (1 << 20) + 50_000, 1);
     assert!((error.error - expected).abs() < 1e-3);
     assert_eq!(measure_viewpoint(&scene, &set, DVec3::ZERO, 0, 1).error, 0.0);
+}
+
+#[test]
+fn the_confidence_bound_is_that_of_students_t() {
+    let viewpoint = |error: f64| ViewpointError {
+        viewpoint: DVec3::ZERO,
+        seed: 0,
+        rays: 1000,
+        wrong: (1000.0 * error) as u32,
+        error,
+    };
+    let of = |errors: &[f64]| CellError {
+        cell: CellId(0),
+        viewpoints: errors.iter().copied().map(viewpoint).collect(),
+    };
+    // Eight of 0.1 and eight of 0.3: s = 0.2 sqrt(4/15), t(0.95, 15) = 1.753.
+    let errors = [[0.1; 8], [0.3; 8]].concat();
+    let expected = 0.2 + 1.753 * 0.1 * (16.0f64 / 15.0).sqrt() / 4.0;
+    let bound = of(&errors).mean_upper_bound();
+    assert!((bound - expected).abs() < 1e-4, "{bound} {expected}");
+    assert_eq!(of(&[0.1; 16]).mean_upper_bound(), of(&[0.1; 16]).mean());
+    assert_eq!(of(&[0.25]).mean_upper_bound(), 0.25);
+    assert_eq!(of(&[]).mean_upper_bound(), 0.0);
 }

@@ -12,10 +12,9 @@ use crate::{
 };
 
 /// Rows and columns of a tile. Small tiles have tight beams, large ones share a walk; these are
-/// the fastest measured on city scenes at N <= 256 and above (docs/benchmarks.md).
-const fn tile_size(rows: u32) -> (usize, usize) {
-    if rows <= 256 { (4, 4) } else { (8, 8) }
-}
+/// the fastest measured, with little between them and their neighbours.
+const TILE_ROWS: usize = 8;
+const TILE_COLUMNS: usize = 4;
 
 /// Weights are summed in units of 2^-60 of the whole (directions x segment), as integers: the
 /// sum does not depend on order, and cannot overflow, since all weights of a segment add up to
@@ -68,8 +67,8 @@ pub fn solve_segment(
         .map(|j| Column::new(sampling.c(f64::from(j) + 0.5), frame.length, &bounds))
         .collect();
     let solid_angles = solid_angles(sampling);
-    let (tile_rows, tile_columns) = tile_size(sampling.rows());
-    let bands = sampling.rows() as usize / tile_rows.min(sampling.rows() as usize);
+    let rows = sampling.rows() as usize;
+    let bands = rows.div_ceil(TILE_ROWS);
 
     let (mut finds, statistics) = (0..FACE_COUNT * bands)
         .into_par_iter()
@@ -81,18 +80,14 @@ pub fn solve_segment(
                 face: frame.face(item / bands),
                 bounds: &bounds,
             };
-            let first_row = item % bands * tile_rows;
-            let end_row = if item % bands + 1 == bands {
-                sampling.rows() as usize
-            } else {
-                first_row + tile_rows
-            };
+            let first_row = item % bands * TILE_ROWS;
+            let end_row = rows.min(first_row + TILE_ROWS);
             let rows: Vec<f64> = (first_row..end_row).map(|i| sampling.w(i as f64 + 0.5)).collect();
             let mut finds: Vec<Find> = Vec::new();
-            for (block, c) in columns.chunks(tile_columns).enumerate() {
+            for (block, c) in columns.chunks(TILE_COLUMNS).enumerate() {
                 solver.solve(&context, &rows, c, |primitive, pixel, length| {
                     let (row, column) =
-                        (first_row + pixel / c.len(), block * tile_columns + pixel % c.len());
+                        (first_row + pixel / c.len(), block * TILE_COLUMNS + pixel % c.len());
                     let share = length * solid_angles[row * columns.len() + column];
                     finds.push((primitive, (share * WEIGHT_UNIT) as u64));
                 });

@@ -331,7 +331,7 @@ impl TileSolver {
                 continue;
             }
             let primitive = instance.first_primitive.0 + item as u32;
-            for row in 0..self.rows.len() {
+            for row in rows_met(&self.rows, &corners) {
                 let on_axis = context.bounds.depth;
                 if let Some(cut) = Cut::of_triangle(&corners, self.rows[row], on_axis, primitive) {
                     self.counters.cuts += 1;
@@ -380,6 +380,22 @@ impl TileSolver {
             }
         }
     }
+}
+
+/// The rows (ascending) whose plane may cut a triangle: those between the least and the largest
+/// y / z of its corners. The margin is some 1,000 times the rounding of either side, where |y| is
+/// of the size of z; where it is larger, the signs are beyond doubt.
+#[inline]
+fn rows_met(rows: &[f64], corners: &[DVec3; 3]) -> std::ops::Range<usize> {
+    if corners.iter().any(|p| p.z <= 0.0) {
+        return 0..rows.len();
+    }
+    let w = corners.map(|p| p.y / p.z);
+    let first = w[0].min(w[1]).min(w[2]) - 1e-12;
+    let last = w[0].max(w[1]).max(w[2]) + 1e-12;
+    let before = rows.iter().take_while(|&&w| w < first).count();
+    let behind = rows.iter().rev().take_while(|&&w| w > last).count();
+    before..(rows.len() - behind).max(before)
 }
 
 /// Recomputes a pixel's bins: the farthest depth where the list covers a bin without a gap.

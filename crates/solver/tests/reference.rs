@@ -78,7 +78,7 @@ fn rounding_decides(scene: &InstancedGeometry, seg: &ViewSegment, sampling: Samp
 
 /// Every primitive that the twin sees for longer than the bound is found, and nothing else.
 fn assert_agrees(scene: &InstancedGeometry, seg: &ViewSegment, rows: u32) {
-    let sampling = Sampling::new(rows);
+    let sampling = Sampling::with_columns(rows, 2 * rows);
     if rounding_decides(scene, seg, sampling) {
         return;
     }
@@ -196,7 +196,7 @@ fn closed_mesh_does_not_leak_at_shared_edges() {
         );
         let at = |x: f64, y: f64, z: f64| map.transform_point3(DVec3::new(x, y, z));
         let seg = segment(at(-3.0, -1.0, 0.5), at(4.0, 2.0, -1.0));
-        let found = solve_segment(&scene, &seg, Sampling::new(96));
+        let found = solve_segment(&scene, &seg, Sampling::with_columns(96, 192));
         let leaked = found.set.count_in(count..2 * count);
         assert_eq!(leaked, 0, "turn {turn}");
         let whole: f64 = found.weights.iter().map(|w| f64::from(*w)).sum();
@@ -229,7 +229,7 @@ fn coplanar_triangles_go_to_the_lower_number_once() {
     });
     let scene = InstancedGeometry::new(vec![mesh], instances.collect());
     let at = |x: f64| map.transform_point3(DVec3::new(x, 0.1, 0.0));
-    let found = solve_segment(&scene, &segment(at(-1.0), at(2.0)), Sampling::new(32));
+    let found = solve_segment(&scene, &segment(at(-1.0), at(2.0)), Sampling::with_columns(32, 64));
     assert_eq!(found.set.iter().map(|p| p.0).collect::<Vec<_>>(), [0, 1]);
 }
 
@@ -251,7 +251,7 @@ fn threads_do_not_change_the_result() {
     let seg = segment(DVec3::new(-1.0, 0.2, 0.3), DVec3::new(2.0, 0.1, -0.7));
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| solve_segment(&scene, &seg, Sampling::new(64)))
+        pool.install(|| solve_segment(&scene, &seg, Sampling::with_columns(64, 128)))
     };
     let one = on(1);
     assert!(one.set.len() > 40, "{}", one.set.len());
