@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use serde_json::Value;
-use sightline_geometry::CellId;
+use sightline_geometry::{CellId, PrimitiveId};
 use sightline_scene::{OpenOptions, Scene};
 use sightline_store::{BakeStore, CellRow, Dataset};
 use sightline_tests::binaries::sightline;
@@ -133,18 +133,44 @@ impl Baked {
         Self { scene, rows }
     }
 
+    /// True when the middle of a triangle lies on another one, up to the rounding of the files.
+    /// Which of the two is seen hangs on the last bit of their heights, and the files differ there.
+    fn ties(&self, triangle: &[DVec3; 3]) -> bool {
+        let [p, q, r] = *triangle;
+        let middle = (p + q + r) / 3.0;
+        let geometry = &self.scene.geometry;
+        let own = key(triangle);
+        let lies_on = |t: u32| {
+            let corners = geometry.triangle(PrimitiveId(t)).corners;
+            let [a, b, c] = corners;
+            let normal = (b - a).cross(c - a).normalize_or_zero();
+            let inside = |p: DVec3, q: DVec3| (q - p).cross(middle - p).dot(normal) >= 0.0;
+            normal != DVec3::ZERO
+                && normal.dot(middle - a).abs() <= ROUNDING
+                && inside(a, b)
+                && inside(b, c)
+                && inside(c, a)
+                && key(&sorted(corners)) != own
+        };
+        (0..geometry.primitive_count()).any(lies_on)
+    }
+
     /// World-space corners of the visible triangles of a cell, in an order that does not depend
     /// on the numbering.
     fn visible(&self, cell: CellId) -> Vec<[DVec3; 3]> {
         let row = self.rows.iter().find(|r| r.cell.id == cell).expect("the cell is there");
-        let sorted = |mut corners: [DVec3; 3]| {
-            corners.sort_by(|a, b| {
-                a.to_array().map(tenth_millimetres).cmp(&b.to_array().map(tenth_millimetres))
-            });
-            corners
-        };
         row.set.iter().map(|p| sorted(self.scene.geometry.triangle(p).corners)).collect()
     }
+}
+
+/// Positions of the two files differ by at most this, metres.
+const ROUNDING: f64 = 1e-4;
+
+fn sorted(mut corners: [DVec3; 3]) -> [DVec3; 3] {
+    corners.sort_by(|a, b| {
+        a.to_array().map(tenth_millimetres).cmp(&b.to_array().map(tenth_millimetres))
+    });
+    corners
 }
 
 fn tenth_millimetres(metres: f64) -> i64 {
@@ -172,7 +198,7 @@ fn without_partner(a: &[[DVec3; 3]], b: &[[DVec3; 3]]) -> Vec<[DVec3; 3]> {
     }
     // What sits on a rounding border: look at the corners themselves.
     let is_close = |p: &[DVec3; 3], q: &[DVec3; 3]| {
-        p.iter().all(|x| q.iter().any(|y| (*x - *y).abs().max_element() <= 1e-4))
+        p.iter().all(|x| q.iter().any(|y| (*x - *y).abs().max_element() <= ROUNDING))
     };
     left.retain(|p| !b.iter().any(|q| is_close(p, q)));
     left
@@ -196,7 +222,9 @@ fn hospital_and_its_gpu_instanced_twin_see_the_same_triangles() {
     let mut differences = Vec::new();
     for row in &a.rows {
         let (x, y) = (a.visible(row.cell.id), b.visible(row.cell.id));
-        let (only_plain, only_twin) = (without_partner(&x, &y), without_partner(&y, &x));
+        let (mut only_plain, mut only_twin) = (without_partner(&x, &y), without_partner(&y, &x));
+        only_plain.retain(|t| !a.ties(t));
+        only_twin.retain(|t| !b.ties(t));
         if !only_plain.is_empty() || !only_twin.is_empty() {
             differences.push(format!(
                 "cell {}: {} and {} visible; {} only in the plain scene, {} only in its twin: {:?} {:?}",
