@@ -1,7 +1,8 @@
-//! Times the solves of the segments around a rectangle.
+//! Times the solves of the segments around a rectangle, and measures the pixel error of each
+//! segment's set at viewpoints on that segment.
 //!
 //! ```sh
-//! cargo run --release -p sightline-benches --bin segments -- SCENE --region=-60,20,40,120 --y 5 --length 10 --rows 104
+//! cargo run --release -p sightline-benches --bin segments -- SCENE --region=-30,50,-10,70 --y 13.7
 //! ```
 #![allow(clippy::print_stdout)]
 
@@ -27,7 +28,7 @@ struct Arguments {
     /// Length of the pieces that the sides are cut into, metres.
     #[arg(long, default_value_t = 10.0)]
     length: f64,
-    /// Random viewpoints a segment, at which the error of its set is measured.
+    /// Viewpoints, spread evenly over a segment, at which the error of its set is measured.
     #[arg(long, default_value_t = 0)]
     viewpoints: u32,
     /// Rays a viewpoint.
