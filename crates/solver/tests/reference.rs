@@ -76,12 +76,15 @@ fn rounding_decides(scene: &InstancedGeometry, seg: &ViewSegment, sampling: Samp
         })
 }
 
-/// Every primitive that the twin sees for longer than the bound is found, and nothing else.
-fn assert_agrees(scene: &InstancedGeometry, seg: &ViewSegment, rows: u32) {
-    let sampling = Sampling::with_columns(rows, 2 * rows);
-    if rounding_decides(scene, seg, sampling) {
-        return;
-    }
+/// Four rows are enough to meet every case; the twin is slow.
+fn sampling() -> Sampling {
+    Sampling::with_columns(4, 8)
+}
+
+/// Every primitive that the twin sees for longer than the bound is found, and nothing else. Not
+/// for scenes in which [`rounding_decides`].
+fn assert_agrees(scene: &InstancedGeometry, seg: &ViewSegment) {
+    let sampling = sampling();
     let fast = solve_segment(scene, seg, sampling);
     let exact = reference::solve_segment(scene, seg, sampling);
     let frame = RectifiedFrame::new(seg).unwrap();
@@ -132,7 +135,8 @@ proptest! {
     ) {
         let scene = geometry(vec![(a, true), (b, true), (glass, false)], DVec3::ZERO);
         let seg = segment(DVec3::ZERO, DVec3::from_array(end.map(f64::from)) + DVec3::splat(0.1));
-        assert_agrees(&scene, &seg, 4);
+        prop_assume!(!rounding_decides(&scene, &seg, sampling()));
+        assert_agrees(&scene, &seg);
     }
 
     #[test]
@@ -142,7 +146,8 @@ proptest! {
         let far = DVec3::new(1e7, -3e5, 1e6);
         let scene = geometry(vec![(a, true)], far);
         let seg = segment(far, far + DVec3::from_array(end.map(f64::from)) + DVec3::splat(0.1));
-        assert_agrees(&scene, &seg, 4);
+        prop_assume!(!rounding_decides(&scene, &seg, sampling()));
+        assert_agrees(&scene, &seg);
     }
 }
 
@@ -276,6 +281,8 @@ proptest! {
             occluder: true,
         }]);
         let end = DVec3::new(f64::from(end.0), f64::from(end.1), f64::from(end.2));
-        assert_agrees(&scene, &segment(DVec3::ZERO, end), 4);
+        let seg = segment(DVec3::ZERO, end);
+        prop_assume!(!rounding_decides(&scene, &seg, sampling()));
+        assert_agrees(&scene, &seg);
     }
 }
