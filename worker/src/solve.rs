@@ -30,9 +30,11 @@ pub fn solve_segments(
         .collect()
 }
 
-/// The one place that calls the solver.
+/// The one place that calls the solver. Segments differ in where the rays of their pixels are:
+/// neighbours on one line would otherwise share their rows.
 #[must_use]
 pub fn solve_segment(scene: &Scene, segment: &ViewSegment, sampling: Sampling) -> SegmentRow {
+    let sampling = sampling.jittered(segment.id.0);
     let found = sightline_solver::solve_segment(&scene.geometry, segment, sampling);
     SegmentRow { segment: segment.id, set: found.set, weights: found.weights }
 }

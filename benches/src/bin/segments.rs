@@ -31,6 +31,12 @@ struct Arguments {
     /// Viewpoints, spread evenly over a segment, at which the error of its set is measured.
     #[arg(long, default_value_t = 0)]
     viewpoints: u32,
+    /// Solve every segment with the rays of its pixels in the same place.
+    #[arg(long)]
+    no_jitter: bool,
+    /// Viewpoints, spread evenly over the rectangle, at which the error of the union is measured.
+    #[arg(long, default_value_t = 0)]
+    inside: u32,
     /// Rays a viewpoint.
     #[arg(long, default_value_t = 100_000)]
     rays: u32,
@@ -67,6 +73,7 @@ fn main() {
     let mut total = Statistics::default();
     let mut sets = Vec::new();
     for segment in &segments {
+        let sampling = if arguments.no_jitter { sampling } else { sampling.jittered(segment.id.0) };
         let found = sightline_solver::solve_segment(&scene.geometry, segment, sampling);
         total = total.plus(found.statistics);
         sets.push(found.set);
@@ -81,6 +88,23 @@ fn main() {
         scene.geometry.primitive_count()
     );
     println!("in all: {total:?}");
+    if arguments.inside > 0 {
+        let (mut sum, mut worst) = (0.0, 0.0f64);
+        for k in 0..arguments.inside {
+            let f = |s: f64| (0.5 + f64::from(k) * s).fract();
+            let [x0, z0, x1, z1] = arguments.region[..] else { panic!() };
+            let at = DVec3::new(
+                x0 + f(0.7548776662466927) * (x1 - x0),
+                arguments.y,
+                z0 + f(0.5698402909980532) * (z1 - z0),
+            );
+            let e = measure_viewpoint(&scene.geometry, &all, at, arguments.rays, u64::from(k));
+            sum += e.error;
+            worst = worst.max(e.error);
+        }
+        let mean = sum / f64::from(arguments.inside);
+        println!("inside: mean {:.5} %, worst {:.5} %", 100.0 * mean, 100.0 * worst);
+    }
     if arguments.viewpoints > 0 {
         let (mut sum, mut worst) = (0.0, 0.0f64);
         for (segment, set) in segments.iter().zip(&sets) {

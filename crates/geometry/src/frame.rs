@@ -86,16 +86,17 @@ impl RectifiedFrame {
     }
 }
 
-/// The pixel grid of a face, sampled at pixel centres.
+/// The pixel grid of a face, with one ray a pixel: at its centre, or [jittered](Self::jittered).
 ///
 /// Rows and columns are not alike. What lies between two rows is not seen from anywhere on the
 /// segment. What lies between two columns may be: while the viewpoint moves by L, a column sweeps
-/// over L metres of its row's plane. So columns are half as dense as rows; docs/adr/0007 has the
-/// measurements.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// over L metres of its row's plane. docs/adr/0007 has the measurements.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sampling {
     rows: u32,
     columns: u32,
+    row_phase: f64,
+    column_phase: f64,
 }
 
 impl Sampling {
@@ -110,7 +111,36 @@ impl Sampling {
     #[must_use]
     pub fn with_columns(rows: u32, columns: u32) -> Self {
         let round = |n: u32| n.max(4).next_multiple_of(4);
-        Self { rows: round(rows), columns: round(columns) }
+        Self { rows: round(rows), columns: round(columns), row_phase: 0.5, column_phase: 0.5 }
+    }
+
+    /// The same grid with its rays elsewhere in their pixels: number `run` of a sequence of grids
+    /// whose rows, and columns, are spread evenly together. Run 0 has its rays in the centres.
+    ///
+    /// Segments that are solved on different runs find more together: on one line they would
+    /// share their rows, and what lies between two rows is seen by none of them.
+    ///
+    /// Source: the additive recurrence R2 (Roberts, "The Unreasonable Effectiveness of
+    /// Quasirandom Sequences").
+    #[must_use]
+    pub fn jittered(self, run: u32) -> Self {
+        const PLASTIC: f64 = 1.324_717_957_244_746;
+        // The border of the first column is the axis itself, which is no direction of the face.
+        let phase = |step: f64| (0.5 + f64::from(run) * step).fract().max(1.0 / 1024.0);
+        let (row_phase, column_phase) = (phase(1.0 / PLASTIC), phase(1.0 / (PLASTIC * PLASTIC)));
+        Self { row_phase, column_phase, ..self }
+    }
+
+    /// The coordinate w of the rays of row `i`.
+    #[must_use]
+    pub fn row(&self, i: u32) -> f64 {
+        self.w(f64::from(i) + self.row_phase)
+    }
+
+    /// The coordinate c of the rays of column `j`.
+    #[must_use]
+    pub fn column(&self, j: u32) -> f64 {
+        self.c(f64::from(j) + self.column_phase)
     }
 
     /// Number of rows a face, N.
@@ -125,8 +155,8 @@ impl Sampling {
         self.columns
     }
 
-    /// The row coordinate w at pixel coordinate `i` in [0, N]: pixel centres are at `k + 0.5`,
-    /// the borders of row k at `k` and `k + 1`. In [-1, 1], ascending.
+    /// The row coordinate w at pixel coordinate `i` in [0, N]: the borders of row k are at `k` and
+    /// `k + 1`. In [-1, 1], ascending.
     #[must_use]
     pub fn w(&self, i: f64) -> f64 {
         2.0 * i / f64::from(self.rows) - 1.0

@@ -214,14 +214,14 @@ pub fn solve_segment(
     for face in 0..FACE_COUNT {
         let triangles = face_triangles(geometry, frame.v0, &frame.face(face));
         for row in 0..sampling.rows() {
-            let w = sampling.w(f64::from(row) + 0.5);
+            let w = sampling.row(row);
             let exact_w = exact(w);
             let cuts: Vec<_> = triangles
                 .iter()
                 .filter_map(|t| Some((cut(&t.corners, &exact_w)?, t.primitive, t.occluder)))
                 .collect();
             for column in 0..sampling.columns() {
-                let c = sampling.c(f64::from(column) + 0.5);
+                let c = sampling.column(column);
                 let exact_c = exact(c);
                 let at_column = |occluder: bool| -> Vec<Stretch> {
                     cuts.iter()

@@ -64,7 +64,7 @@ pub fn solve_segment(
     let Some(frame) = RectifiedFrame::new(segment) else { return SegmentVisibility::default() };
     let bounds = ErrorBounds::new(geometry.bounds, &frame);
     let columns: Vec<Column> = (0..sampling.columns())
-        .map(|j| Column::new(sampling.c(f64::from(j) + 0.5), frame.length, &bounds))
+        .map(|j| Column::new(sampling.column(j), frame.length, &bounds))
         .collect();
     let solid_angles = solid_angles(sampling);
     let rows = sampling.rows() as usize;
@@ -82,7 +82,7 @@ pub fn solve_segment(
             };
             let first_row = item % bands * TILE_ROWS;
             let end_row = rows.min(first_row + TILE_ROWS);
-            let rows: Vec<f64> = (first_row..end_row).map(|i| sampling.w(i as f64 + 0.5)).collect();
+            let rows: Vec<f64> = (first_row..end_row).map(|i| sampling.row(i as u32)).collect();
             let mut finds: Vec<Find> = Vec::new();
             for (block, c) in columns.chunks(TILE_COLUMNS).enumerate() {
                 solver.solve(&context, &rows, c, |primitive, pixel, length| {

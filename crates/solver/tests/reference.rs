@@ -70,7 +70,7 @@ fn rounding_decides(scene: &InstancedGeometry, seg: &ViewSegment, sampling: Samp
         || (0..FACE_COUNT).any(|face| {
             let face = frame.face(face);
             (0..sampling.rows()).any(|row| {
-                let w = sampling.w(f64::from(row) + 0.5);
+                let w = sampling.row(row);
                 points.iter().any(|p| (p.dot(face.up) - w * p.dot(face.forward)).abs() <= bound)
             })
         })
