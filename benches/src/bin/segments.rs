@@ -13,7 +13,7 @@ use glam::DVec3;
 use sightline_geometry::{PrimitiveSet, Sampling, SegmentId, ViewSegment};
 use sightline_quality::measure_viewpoint;
 use sightline_scene::{OpenOptions, Scene};
-use sightline_solver::Statistics;
+use sightline_solver::{SolveOptions, Statistics, solve_segment_with};
 
 #[derive(Parser)]
 struct Arguments {
@@ -31,6 +31,18 @@ struct Arguments {
     /// Viewpoints, spread evenly over a segment, at which the error of its set is measured.
     #[arg(long, default_value_t = 0)]
     viewpoints: u32,
+    /// Passes of options.
+    #[arg(long, default_value_t = 0)]
+    passes: u32,
+    /// A tile is refined when this share of (directions x segment) may be missing in it.
+    #[arg(long, default_value_t = 1e-6)]
+    threshold: f64,
+    /// Take what segments before saw for known.
+    #[arg(long)]
+    known: bool,
+    /// Solve every segment this many times, and take the least time of each.
+    #[arg(long, default_value_t = 1)]
+    repeat: u32,
     /// Solve every segment with the rays of its pixels in the same place.
     #[arg(long)]
     no_jitter: bool,
@@ -69,16 +81,35 @@ fn main() {
     let segments = perimeter(&arguments.region, arguments.y, arguments.length);
     let rows = arguments.rows;
     let sampling = Sampling::with_columns(rows, arguments.columns.unwrap_or(rows));
-    let began = Instant::now();
+    let (mut seconds, mut missing) = (0.0, 0.0);
     let mut total = Statistics::default();
     let mut sets = Vec::new();
+    let mut known = PrimitiveSet::default();
     for segment in &segments {
         let sampling = if arguments.no_jitter { sampling } else { sampling.jittered(segment.id.0) };
-        let found = sightline_solver::solve_segment(&scene.geometry, segment, sampling);
+        let mut least = f64::INFINITY;
+        let mut found = None;
+        for _ in 0..arguments.repeat.max(1) {
+            let began = Instant::now();
+            let options = SolveOptions {
+                passes: arguments.passes,
+                threshold: arguments.threshold,
+                known: arguments.known.then_some(&known),
+                portable: false,
+            };
+            found = Some(solve_segment_with(&scene.geometry, segment, sampling, &options));
+            least = least.min(began.elapsed().as_secs_f64());
+        }
+        seconds += least;
+        let found = found.expect("solved at least once");
         total = total.plus(found.statistics);
+        missing += found.missing;
+        if arguments.known {
+            known = PrimitiveSet::union([&known, &found.set]);
+        }
         sets.push(found.set);
     }
-    let seconds = began.elapsed().as_secs_f64();
+    println!("estimated missing: {:.5} % a segment", 100.0 * missing / segments.len() as f64);
     let n = segments.len() as f64;
     let all = PrimitiveSet::union(&sets);
     println!(

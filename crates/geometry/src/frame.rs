@@ -86,6 +86,10 @@ impl RectifiedFrame {
     }
 }
 
+/// The border of the first column is the axis itself, which is no direction of a face: rays keep
+/// away from borders by this part of a pixel.
+const LEAST_PHASE: f64 = 1.0 / 1024.0;
+
 /// The pixel grid of a face, with one ray a pixel: at its centre, or [jittered](Self::jittered).
 ///
 /// Rows and columns are not alike. What lies between two rows is not seen from anywhere on the
@@ -125,10 +129,22 @@ impl Sampling {
     #[must_use]
     pub fn jittered(self, run: u32) -> Self {
         const PLASTIC: f64 = 1.324_717_957_244_746;
-        // The border of the first column is the axis itself, which is no direction of the face.
-        let phase = |step: f64| (0.5 + f64::from(run) * step).fract().max(1.0 / 1024.0);
+        let phase = |step: f64| (0.5 + f64::from(run) * step).fract().max(LEAST_PHASE);
         let (row_phase, column_phase) = (phase(1.0 / PLASTIC), phase(1.0 / (PLASTIC * PLASTIC)));
         Self { row_phase, column_phase, ..self }
+    }
+
+    /// Twice as many rows and columns, whose rays are not where those of this grid are but as far
+    /// from them as they can be.
+    #[must_use]
+    pub fn finer(self) -> Self {
+        let phase = |coarse: f64| (2.0 * coarse + 0.5).fract().max(LEAST_PHASE);
+        Self {
+            rows: 2 * self.rows,
+            columns: 2 * self.columns,
+            row_phase: phase(self.row_phase),
+            column_phase: phase(self.column_phase),
+        }
     }
 
     /// The coordinate w of the rays of row `i`.

@@ -60,7 +60,8 @@ impl Mesh {
 
     /// Mesh-space corners of triangle `t` as stored.
     #[inline(always)]
-    pub(crate) fn stored_corners(&self, t: usize) -> [[f32; 3]; 3] {
+    #[must_use]
+    pub fn stored_corners(&self, t: usize) -> [[f32; 3]; 3] {
         let [a, b, c] = self.triangles[t];
         [self.positions[a as usize], self.positions[b as usize], self.positions[c as usize]]
     }

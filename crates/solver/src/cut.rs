@@ -31,7 +31,7 @@ pub struct Cut {
     pub primitive: u32,
 }
 
-#[inline]
+#[inline(always)]
 fn edge(p: DVec3, q: DVec3, hp: f64, hq: f64) -> (f64, f64) {
     let swap = (q.x, q.y, q.z) < (p.x, p.y, p.z);
     let (p, q, hp, hq) = if swap { (q, p, hq, hp) } else { (p, q, hp, hq) };
@@ -44,7 +44,7 @@ impl Cut {
     /// front of the camera. `on_axis` is the largest rounding error of a face coordinate, metres:
     /// a cut no deeper than that lies on the axis. A triangle whose plane holds the segment has
     /// such cuts; seen edge-on from everywhere, it hides nothing.
-    #[inline]
+    #[inline(always)]
     #[must_use]
     pub fn of_triangle(corners: &[DVec3; 3], w: f64, on_axis: f64, primitive: u32) -> Option<Self> {
         let h = corners.map(|p| p.y - w * p.z);
@@ -59,14 +59,14 @@ impl Cut {
         let (i, j) = ((k + 1) % 3, (k + 2) % 3);
         let (xa, za) = edge(corners[k], corners[i], h[k], h[i]);
         let (xb, zb) = edge(corners[k], corners[j], h[k], h[j]);
-        if za.max(zb) <= on_axis {
+        if za <= on_axis && zb <= on_axis {
             return None;
         }
         Self { xa, za, xb, zb, primitive }.clipped()
     }
 
     /// The part with z >= 0; `None` when nothing lies in front.
-    #[inline]
+    #[inline(always)]
     fn clipped(self) -> Option<Self> {
         match (self.za > 0.0, self.zb > 0.0) {
             (true, true) => Some(self),
@@ -84,7 +84,7 @@ impl Cut {
     }
 
     /// The times at which the two ends are on the ray of column `c`: (x - c z) / L.
-    #[inline]
+    #[inline(always)]
     #[must_use]
     pub fn times(&self, c: f64, inverse_length: f64) -> (f64, f64) {
         ((self.xa - c * self.za) * inverse_length, (self.xb - c * self.zb) * inverse_length)

@@ -1,29 +1,45 @@
-//! The visibility list of a pixel: the lower envelope of cuts in (t, z).
+//! The visibility lists of a tile's pixels: lower envelopes of cuts in (t, z).
 //!
-//! At column c a cut covers t between its ends' times, and its depth is linear in t between them.
-//! The list holds, in order of t, the pieces on which a cut is nearest. An interval keeps a
-//! reference to its cut: depths are evaluated from the cut's own ends, never from ends that were
-//! split before, so nothing drifts.
+//! At column c a cut covers t between its ends' times, and its depth is linear in t between them:
+//! a [`Line`]. A pixel's list holds, in order of t, the pieces on which a line is nearest. A piece
+//! keeps a reference to its line: depths are evaluated from the cut's own ends, never from ends
+//! that were split before, so nothing drifts.
 //!
-//! Two cuts are compared at both ends of the stretch they share. Depths that differ by less than
-//! the derived bound are equal; equal at one end is decided at the other; equal at both goes to
-//! the lower primitive number. A crossing is computed from the pair alone (over the whole
+//! Lists are kept by *bins*, equal stretches of t. A cut is inserted into each bin that it meets,
+//! so an insertion touches two or three pieces, however many a pixel has. A bin also has its
+//! *far* depth: the farthest of its pieces where they cover it without a gap, infinite elsewhere.
+//! What is behind the far depths of all the bins that it can meet is hidden.
+//!
+//! Two cuts are compared at both ends of the stretch they share in a bin. Depths that differ by
+//! less than the derived bound are equal; equal at one end is decided at the other; equal at both
+//! goes to the lower primitive number. A crossing is computed from the pair alone (over the whole
 //! stretch on which both exist), so it does not depend on what was inserted between.
 //!
-//! Invariants ([`assert_well_formed`]): pieces are sorted, disjoint, not empty, inside [0, 1)
-//! (VI-1).
+//! Invariants ([`Envelopes::assert_well_formed`]):
+//! - pieces are sorted, disjoint, not empty, inside their bin (VI-1);
+//! - no piece is farther than its bin's far depth.
+
+use sightline_geometry::UNIT_ROUNDOFF;
 
 use crate::{bounds::ErrorBounds, cut::Cut};
 
-/// A half-open stretch `t0 <= t < t1` on which a cut is nearest.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Interval {
-    /// Start, in [0, 1).
-    pub t0: f64,
-    /// End, in (0, 1].
-    pub t1: f64,
-    /// Index of the cut in the tile's list.
-    pub cut: u32,
+/// Bins over t of a pixel. Eight let a 10 m segment see past a street corner bin by bin, and keep
+/// the lists of a city two or three pieces long.
+pub const BINS: usize = 8;
+
+/// Pieces that a bin holds before it moves to a larger place.
+const FIRST_CAPACITY: u32 = 4;
+
+/// The lesser of two numbers, neither of them NaN: one instruction, unlike [`f64::min`].
+#[inline(always)]
+pub(crate) fn least(a: f64, b: f64) -> f64 {
+    if a < b { a } else { b }
+}
+
+/// The larger of two numbers, neither of them NaN.
+#[inline(always)]
+pub(crate) fn largest(a: f64, b: f64) -> f64 {
+    if a > b { a } else { b }
 }
 
 /// What a column fixes for the evaluation of cuts.
@@ -62,46 +78,63 @@ pub struct Line {
     t: f64,
     z: f64,
     slope: f64,
-    near: f64,
+    /// Least depth, metres.
+    pub near: f64,
     far: f64,
-    error: f64,
+    /// Largest error of a depth, metres.
+    pub error: f64,
+    /// Global number of the primitive.
+    pub primitive: u32,
 }
 
 impl Line {
-    /// The cut seen at a column.
-    #[inline]
+    /// The cut seen at a column, where its ends (a, b) are seen at `times`, which differ.
+    #[inline(always)]
     #[must_use]
-    pub fn new(cut: &Cut, column: &Column) -> Self {
-        let (ta, tb) = cut.times(column.c, column.inverse_length);
+    pub fn new(cut: &Cut, column: &Column, (ta, tb): (f64, f64)) -> Self {
         let slope = (cut.zb - cut.za) / (tb - ta);
-        let (near, far) = (cut.za.min(cut.zb), cut.za.max(cut.zb));
+        let (near, far) = (least(cut.za, cut.zb), largest(cut.za, cut.zb));
         // A time off by `time_error` moves the depth along the slope, but not beyond the ends.
-        let error = column.depth_error + (slope.abs() * column.time_error).min(far - near);
-        Self { start: ta.min(tb), end: ta.max(tb), t: ta, z: cut.za, slope, near, far, error }
+        let error = column.depth_error + least(slope.abs() * column.time_error, far - near);
+        Self {
+            start: least(ta, tb),
+            end: largest(ta, tb),
+            t: ta,
+            z: cut.za,
+            slope,
+            near,
+            far,
+            error,
+            primitive: cut.primitive,
+        }
     }
 
     /// Depth at `t`, metres.
-    #[inline]
+    #[inline(always)]
     #[must_use]
     pub fn depth(&self, t: f64) -> f64 {
-        (self.z + (t - self.t) * self.slope).clamp(self.near, self.far)
+        let z = self.z + (t - self.t) * self.slope;
+        least(largest(z, self.near), self.far)
+    }
+
+    /// No depth on `s..e` is larger than this, errors included.
+    #[inline(always)]
+    fn farthest(&self, s: f64, e: f64) -> f64 {
+        let far = largest(self.depth(s), self.depth(e));
+        far + self.error + 4.0 * UNIT_ROUNDOFF * far
     }
 }
 
 /// Sign of the depth difference `a - b` at `t`: -1 when a is nearer, 0 within the bound.
-#[inline]
+#[inline(always)]
 fn compare(a: &Line, b: &Line, t: f64) -> i32 {
     let difference = a.depth(t) - b.depth(t);
-    if difference.abs() <= a.error + b.error {
-        0
-    } else if difference < 0.0 {
-        -1
-    } else {
-        1
-    }
+    let bound = a.error + b.error;
+    i32::from(difference > bound) - i32::from(difference < -bound)
 }
 
 /// Who is nearer on a stretch.
+#[derive(Clone, Copy, Debug, PartialEq)]
 enum Nearer {
     New,
     Old,
@@ -109,129 +142,288 @@ enum Nearer {
     OldThenNew(f64),
 }
 
-/// Decides between two cuts on `s..e`; `new_first` tells whether the new one has the lower number.
-#[inline]
-fn decide(new: &Line, old: &Line, s: f64, e: f64, new_first: bool) -> Nearer {
-    match (compare(new, old, s), compare(new, old, e)) {
-        (0, 0) => {
-            if new_first {
-                Nearer::New
-            } else {
-                Nearer::Old
-            }
-        }
-        (at_s, at_e) if at_s <= 0 && at_e <= 0 => Nearer::New,
-        (at_s, at_e) if at_s >= 0 && at_e >= 0 => Nearer::Old,
-        (at_s, _) => {
-            let (a, b) = if new_first { (new, old) } else { (old, new) };
-            let (from, to) = (a.start.max(b.start), a.end.min(b.end));
-            let (d0, d1) = (a.depth(from) - b.depth(from), a.depth(to) - b.depth(to));
-            let t = (from + (to - from) * (d0 / (d0 - d1))).clamp(s, e);
-            if at_s < 0 { Nearer::NewThenOld(t) } else { Nearer::OldThenNew(t) }
-        }
+/// Decides between two lines on `s..e`. `tie` is true when the new one wins a tie.
+#[inline(always)]
+fn decide(new: &Line, old: &Line, s: f64, e: f64, tie: bool) -> Nearer {
+    let (at_s, at_e) = (compare(new, old, s), compare(new, old, e));
+    if at_s == 0 && at_e == 0 {
+        return if tie { Nearer::New } else { Nearer::Old };
     }
+    if at_s >= 0 && at_e >= 0 {
+        return Nearer::Old;
+    }
+    if at_s <= 0 && at_e <= 0 {
+        return Nearer::New;
+    }
+    let (a, b) = if new.primitive < old.primitive { (new, old) } else { (old, new) };
+    let (from, to) = (largest(a.start, b.start), least(a.end, b.end));
+    let (d0, d1) = (a.depth(from) - b.depth(from), a.depth(to) - b.depth(to));
+    let t = least(largest(from + (to - from) * (d0 / (d0 - d1)), s), e);
+    if at_s < 0 { Nearer::NewThenOld(t) } else { Nearer::OldThenNew(t) }
 }
 
-/// Appends a piece; joins it to the last one if that is the same cut.
-#[inline]
-fn push(out: &mut Vec<Interval>, t0: f64, t1: f64, cut: u32) {
+/// A half-open stretch `t0 <= t < t1` of a bin on which a line is nearest.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Piece {
+    t0: f64,
+    t1: f64,
+    /// No depth of the piece is larger.
+    far: f64,
+    line: u32,
+}
+
+/// Where the pieces of a bin are.
+#[derive(Clone, Copy, Debug, Default)]
+struct Bin {
+    first: u32,
+    len: u32,
+    capacity: u32,
+}
+
+/// The lists of a tile's pixels.
+#[derive(Debug, Default)]
+pub struct Envelopes {
+    lines: Vec<Line>,
+    pieces: Vec<Piece>,
+    /// `pixel * BINS + bin`.
+    bins: Vec<Bin>,
+    /// Far depths a pixel.
+    far: Vec<[f64; BINS]>,
+    scratch: Vec<Piece>,
+}
+
+/// The bin that holds `t`, which is in [0, 1].
+#[inline(always)]
+#[must_use]
+pub fn bin_of(t: f64) -> usize {
+    ((t * BINS as f64) as usize).min(BINS - 1)
+}
+
+/// The stretch of t of a bin; exact, as `BINS` is a power of two.
+#[inline(always)]
+fn stretch(bin: usize) -> (f64, f64) {
+    (bin as f64 / BINS as f64, (bin + 1) as f64 / BINS as f64)
+}
+
+/// Appends a piece; joins it to the last one if that is the same line.
+#[inline(always)]
+fn push(out: &mut Vec<Piece>, lines: &[Line], t0: f64, t1: f64, line: u32) {
     if t0 >= t1 {
         return;
     }
+    let far = lines[line as usize].farthest(t0, t1);
     match out.last_mut() {
-        Some(last) if last.cut == cut && last.t1 == t0 => last.t1 = t1,
-        _ => out.push(Interval { t0, t1, cut }),
+        Some(last) if last.line == line && last.t1 == t0 => {
+            last.t1 = t1;
+            last.far = largest(last.far, far);
+        }
+        _ => out.push(Piece { t0, t1, far, line }),
     }
 }
 
-/// Inserts cut `new`, which covers `a..b` (inside [0, 1]) at this column, into a pixel's list.
-/// Returns whether it is nearest anywhere. `scratch` is memory to work in.
-pub fn insert(
-    list: &mut Vec<Interval>,
-    scratch: &mut Vec<Interval>,
-    cuts: &[Cut],
-    column: &Column,
-    new: u32,
-    a: f64,
-    b: f64,
-) -> bool {
-    let first = list.partition_point(|p| p.t1 <= a);
-    let behind = first + list[first..].partition_point(|p| p.t0 < b);
-    if first == behind {
-        list.insert(first, Interval { t0: a, t1: b, cut: new });
-        return true;
+impl Envelopes {
+    /// Empties the lists and makes room for `pixels`.
+    pub fn clear(&mut self, pixels: usize) {
+        let bins = pixels * BINS;
+        self.lines.clear();
+        self.bins.clear();
+        self.bins.extend((0..bins as u32).map(|i| Bin {
+            first: i * FIRST_CAPACITY,
+            len: 0,
+            capacity: FIRST_CAPACITY,
+        }));
+        self.pieces.truncate(bins * FIRST_CAPACITY as usize);
+        self.pieces.resize(bins * FIRST_CAPACITY as usize, Piece::default());
+        self.far.clear();
+        self.far.resize(pixels, [f64::INFINITY; BINS]);
     }
-    let new_cut = &cuts[new as usize];
-    let new_line = Line::new(new_cut, column);
-    scratch.clear();
-    let mut won = false;
-    let mut cursor = a;
-    for piece in &list[first..behind] {
-        if cursor < piece.t0 {
-            push(scratch, cursor, piece.t0, new);
+
+    /// The far depths of a pixel, a bin each.
+    #[inline(always)]
+    #[must_use]
+    pub fn far(&self, pixel: usize) -> &[f64; BINS] {
+        &self.far[pixel]
+    }
+
+    /// Inserts a line that covers `a..b` (inside [0, 1], not empty) into a pixel's list. Returns
+    /// whether it is nearest anywhere.
+    #[inline(always)]
+    pub fn insert(&mut self, pixel: usize, line: Line, a: f64, b: f64) -> bool {
+        let number = self.lines.len() as u32;
+        self.lines.push(line);
+        let mut won = false;
+        let near = line.near - line.error;
+        for bin in bin_of(a)..=bin_of(b) {
+            let (start, end) = stretch(bin);
+            let (s, e) = (largest(a, start), least(b, end));
+            if s < e && near <= self.far[pixel][bin] {
+                won |= self.insert_into_bin(pixel, bin, number, s, e);
+            }
+        }
+        if !won {
+            self.lines.pop();
+        }
+        won
+    }
+
+    #[inline(always)]
+    fn insert_into_bin(&mut self, pixel: usize, bin: usize, new: u32, a: f64, b: f64) -> bool {
+        let slot = pixel * BINS + bin;
+        let Bin { first, len, .. } = self.bins[slot];
+        let (first, len) = (first as usize, len as usize);
+        let lines = &self.lines[..];
+        let new_line = &lines[new as usize];
+        let old = &self.pieces[first..first + len];
+
+        let mut before = 0;
+        while before < len && old[before].t1 <= a {
+            before += 1;
+        }
+        let scratch = &mut self.scratch;
+        scratch.clear();
+        let mut won = false;
+        let mut cursor = a;
+        let mut behind = before;
+        while behind < len && old[behind].t0 < b {
+            let piece = old[behind];
+            if cursor < piece.t0 {
+                push(scratch, lines, cursor, piece.t0, new);
+                won = true;
+            }
+            let (s, e) = (largest(piece.t0, a), least(piece.t1, b));
+            let old_line = &lines[piece.line as usize];
+            let tie = new_line.primitive < old_line.primitive;
+            let nearer = decide(new_line, old_line, s, e, tie);
+            if nearer == Nearer::Old {
+                scratch.push(piece);
+            } else {
+                won = true;
+                push(scratch, lines, piece.t0, s, piece.line);
+                match nearer {
+                    Nearer::NewThenOld(t) => {
+                        push(scratch, lines, s, t, new);
+                        push(scratch, lines, t, e, piece.line);
+                    }
+                    Nearer::OldThenNew(t) => {
+                        push(scratch, lines, s, t, piece.line);
+                        push(scratch, lines, t, e, new);
+                    }
+                    _ => push(scratch, lines, s, e, new),
+                }
+                push(scratch, lines, e, piece.t1, piece.line);
+            }
+            cursor = e;
+            behind += 1;
+        }
+        if cursor < b {
+            push(scratch, lines, cursor, b, new);
             won = true;
         }
-        let (s, e) = (piece.t0.max(a), piece.t1.min(b));
-        let old_cut = &cuts[piece.cut as usize];
-        push(scratch, piece.t0, s, piece.cut);
-        let new_first = new_cut.primitive < old_cut.primitive;
-        let nearer = decide(&new_line, &Line::new(old_cut, column), s, e, new_first);
-        match nearer {
-            Nearer::New => push(scratch, s, e, new),
-            Nearer::Old => push(scratch, s, e, piece.cut),
-            Nearer::NewThenOld(t) => {
-                push(scratch, s, t, new);
-                push(scratch, t, e, piece.cut);
+        if won {
+            self.replace(slot, before, behind);
+            let (start, end) = stretch(bin);
+            self.far[pixel][bin] = self.farthest(slot, start, end);
+        }
+        won
+    }
+
+    /// Puts the scratch pieces in the place of `before..behind` of a bin.
+    #[inline(always)]
+    fn replace(&mut self, slot: usize, before: usize, behind: usize) {
+        let bin = &mut self.bins[slot];
+        let first = bin.first as usize;
+        let (len, added) = (bin.len as usize, self.scratch.len());
+        let new_len = len - (behind - before) + added;
+        if new_len <= bin.capacity as usize {
+            self.pieces.copy_within(first + behind..first + len, first + before + added);
+            self.pieces[first + before..first + before + added].copy_from_slice(&self.scratch);
+        } else {
+            let moved = self.pieces.len();
+            self.pieces.extend_from_within(first..first + before);
+            self.pieces.extend_from_slice(&self.scratch);
+            self.pieces.extend_from_within(first + behind..first + len);
+            bin.capacity = 2 * new_len as u32;
+            bin.first = moved as u32;
+            self.pieces.resize(moved + bin.capacity as usize, Piece::default());
+        }
+        self.bins[slot].len = new_len as u32;
+    }
+
+    /// The far depth of a bin.
+    #[inline(always)]
+    fn farthest(&self, slot: usize, start: f64, end: f64) -> f64 {
+        let mut covered = start;
+        let mut far = f64::NEG_INFINITY;
+        for piece in self.of(slot) {
+            if piece.t0 > covered {
+                return f64::INFINITY;
             }
-            Nearer::OldThenNew(t) => {
-                push(scratch, s, t, piece.cut);
-                push(scratch, t, e, new);
+            far = largest(far, piece.far);
+            covered = piece.t1;
+        }
+        if covered >= end { far } else { f64::INFINITY }
+    }
+
+    #[inline(always)]
+    fn of(&self, slot: usize) -> &[Piece] {
+        let bin = self.bins[slot];
+        &self.pieces[bin.first as usize..(bin.first + bin.len) as usize]
+    }
+
+    /// Calls `found(primitive, length)` for every interval of a pixel, in order of t; pieces of a
+    /// line that meet at the border of two bins are one interval.
+    #[inline(always)]
+    pub fn intervals(&self, pixel: usize, mut found: impl FnMut(u32, f64)) {
+        let mut open = Piece::default();
+        for bin in 0..BINS {
+            for piece in self.of(pixel * BINS + bin) {
+                if piece.line == open.line && piece.t0 == open.t1 {
+                    open.t1 = piece.t1;
+                } else {
+                    if open.t0 < open.t1 {
+                        found(self.lines[open.line as usize].primitive, open.t1 - open.t0);
+                    }
+                    open = *piece;
+                }
             }
         }
-        won |= !matches!(nearer, Nearer::Old);
-        push(scratch, e, piece.t1, piece.cut);
-        cursor = e;
+        if open.t0 < open.t1 {
+            found(self.lines[open.line as usize].primitive, open.t1 - open.t0);
+        }
     }
-    if cursor < b {
-        push(scratch, cursor, b, new);
-        won = true;
-    }
-    if won {
-        list.splice(first..behind, scratch.drain(..));
-    }
-    won
-}
 
-/// Length of the part of `a..b` on which `cut` is not behind the list: what is seen of a
-/// see-through cut. The list does not change.
-pub fn unhidden_length(
-    list: &[Interval],
-    cuts: &[Cut],
-    column: &Column,
-    cut: &Cut,
-    a: f64,
-    b: f64,
-) -> f64 {
-    let line = Line::new(cut, column);
-    let mut hidden = 0.0;
-    let first = list.partition_point(|p| p.t1 <= a);
-    for piece in list[first..].iter().take_while(|p| p.t0 < b) {
-        let (s, e) = (piece.t0.max(a), piece.t1.min(b));
-        let old = Line::new(&cuts[piece.cut as usize], column);
-        hidden += match decide(&line, &old, s, e, true) {
-            Nearer::New => 0.0,
-            Nearer::Old => e - s,
-            Nearer::NewThenOld(t) => e - t,
-            Nearer::OldThenNew(t) => t - s,
-        };
+    /// Length of the part of `a..b` on which a line is not behind a pixel's list: what is seen of
+    /// a see-through cut. The list does not change.
+    #[must_use]
+    pub fn unhidden_length(&self, pixel: usize, line: &Line, a: f64, b: f64) -> f64 {
+        let mut hidden = 0.0;
+        for bin in bin_of(a)..=bin_of(b) {
+            for piece in self.of(pixel * BINS + bin) {
+                let (s, e) = (largest(piece.t0, a), least(piece.t1, b));
+                if s < e {
+                    hidden += match decide(line, &self.lines[piece.line as usize], s, e, true) {
+                        Nearer::New => 0.0,
+                        Nearer::Old => e - s,
+                        Nearer::NewThenOld(t) => e - t,
+                        Nearer::OldThenNew(t) => t - s,
+                    };
+                }
+            }
+        }
+        (b - a) - hidden
     }
-    (b - a) - hidden
-}
 
-/// Panics when the list breaks VI-1.
-pub fn assert_well_formed(list: &[Interval]) {
-    for p in list {
-        assert!(0.0 <= p.t0 && p.t0 < p.t1 && p.t1 <= 1.0, "piece {p:?} lies in [0, 1]");
+    /// Panics when a list breaks an invariant of the module.
+    pub fn assert_well_formed(&self) {
+        for (slot, bin) in self.bins.iter().enumerate() {
+            let (start, end) = stretch(slot % BINS);
+            let list = self.of(slot);
+            assert!(bin.len <= bin.capacity);
+            for p in list {
+                assert!(start <= p.t0 && p.t0 < p.t1 && p.t1 <= end, "{p:?} lies in its bin");
+                assert!(p.far <= self.far[slot / BINS][slot % BINS], "{p:?} is not beyond far");
+            }
+            assert!(list.windows(2).all(|w| w[0].t1 <= w[1].t0), "sorted, disjoint: {list:?}");
+        }
     }
-    assert!(list.windows(2).all(|w| w[0].t1 <= w[1].t0), "sorted and disjoint: {list:?}");
 }

@@ -27,4 +27,4 @@ pub mod reference;
 mod segment;
 mod tile;
 
-pub use segment::{SegmentVisibility, Statistics, solve_segment};
+pub use segment::{SegmentVisibility, SolveOptions, Statistics, solve_segment, solve_segment_with};

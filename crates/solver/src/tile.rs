@@ -9,28 +9,34 @@
 //! ```
 //!
 //! so one pass over a node's box gives whether the beam meets it, the stretch of t on which it
-//! can be seen, and its nearest depth. The tile keeps, for each pixel, a coarse z-buffer over t:
-//! `BINS` bins, each with the farthest depth of what covers it wholly (infinite where something
-//! shows through), and the farthest over the pixels above it. A node is skipped when it is
-//! behind all bins that it can touch.
+//! can be seen, and its nearest depth. The pixels' lists are kept by bins of t, each with the
+//! farthest depth of what covers it wholly (infinite where something shows through): see
+//! [`envelope`](crate::envelope). Above them are the farthest over the pixels of a row, and over
+//! the rows of the tile. A node is skipped when it is behind all bins that it can touch.
 //!
 //! Invariant: skipping never changes the result. Boxes and bins are compared with slack for the
 //! rounding of either side, so what is skipped is behind by more than the error bound.
 
 use glam::{DMat3, DVec3};
 use sightline_geometry::{
-    Face, InstanceId, InstancedGeometry, Node, RectifiedFrame, TopLevel, UNIT_ROUNDOFF,
+    Face, InstanceId, InstancedGeometry, Mesh, Node, RectifiedFrame, TopLevel,
 };
 
 use crate::{
     bounds::ErrorBounds,
     cut::Cut,
-    envelope::{self, Column, Interval, Line},
+    envelope::{BINS, Column, Envelopes, Line, bin_of, largest, least},
 };
 
-/// Bins of the coarse z-buffer over t. Eight let a 10 m segment see past a street corner
-/// bin by bin; more cost more to keep than they skip.
-const BINS: usize = 8;
+/// Most rows of a tile. Small tiles have tight beams, large ones share a walk; these are the
+/// fastest measured, with little between them and their neighbours.
+pub const TILE_ROWS: usize = 8;
+
+/// Columns of a tile.
+pub const TILE_COLUMNS: usize = 4;
+
+/// Triangles whose corners are transformed together.
+const LANES: usize = 4;
 
 /// What a hierarchy walk does with the cuts that it finds.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -46,9 +52,9 @@ struct Space {
     face_from_local: DMat3,
     offset: DVec3,
     instance: InstanceId,
-    normal: [DVec3; 5],
-    extent: [DVec3; 5],
-    constant: [f64; 5],
+    normal: [DVec3; 6],
+    extent: [DVec3; 6],
+    constant: [f64; 6],
 }
 
 #[derive(Clone, Copy)]
@@ -63,6 +69,8 @@ struct Entry {
 /// Counters of a solve; sums over tiles.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TileCounters {
+    /// Directions along which the segment was swept.
+    pub rays: u64,
     /// Hierarchy nodes tested against a beam.
     pub nodes: u64,
     /// Triangles whose face coordinates were computed.
@@ -83,69 +91,133 @@ pub struct TileContext<'a> {
     pub bounds: &'a ErrorBounds,
 }
 
+/// Far depths of a group of pixels, a bin each.
+#[derive(Clone, Copy, Debug)]
+struct Far {
+    depths: [f64; BINS],
+    /// True when a pixel has changed since.
+    stale: bool,
+}
+
+impl Default for Far {
+    fn default() -> Self {
+        Self { depths: [f64::INFINITY; BINS], stale: false }
+    }
+}
+
+impl Far {
+    #[inline(always)]
+    fn of<'a>(all: impl Iterator<Item = &'a [f64; BINS]>) -> Self {
+        let mut depths = [f64::NEG_INFINITY; BINS];
+        for one in all {
+            for (far, one) in depths.iter_mut().zip(one) {
+                *far = if *one > *far { *one } else { *far };
+            }
+        }
+        Self { depths, stale: false }
+    }
+
+    /// Whether something no nearer than `near` is hidden in all of these bins.
+    #[inline(always)]
+    fn hides(&self, near: f64, first_bin: u8, last_bin: u8) -> bool {
+        self.depths[first_bin as usize..=last_bin as usize].iter().all(|&far| near > far)
+    }
+}
+
 /// Solves tiles; keeps its memory from tile to tile. One a thread.
 #[derive(Default)]
 pub struct TileSolver {
     rows: Vec<f64>,
     columns: Vec<Column>,
-    lists: Vec<Vec<Interval>>,
-    scratch: Vec<Interval>,
-    cuts: Vec<Cut>,
-    /// Farthest depth a pixel and bin; infinite where not wholly covered.
-    far: Vec<[f64; BINS]>,
-    tile_far: [f64; BINS],
-    tile_far_is_stale: bool,
+    envelopes: Envelopes,
+    row_far: Vec<Far>,
+    tile_far: Far,
     stack: Vec<Entry>,
     spaces: Vec<Space>,
     /// See-through finds: (primitive, pixel in tile, length in t).
     seen_through: Vec<(u32, u32, f64)>,
     pub counters: TileCounters,
+    /// Do without the instructions that only some processors have.
+    pub portable: bool,
 }
 
 impl TileSolver {
     /// Solves the tile of rows `w` and columns `c` (coordinates, ascending) and calls
     /// `found(primitive, pixel, length)` for everything visible on more than the derived bound:
-    /// `pixel` = row * columns + column, `length` in units of t.
+    /// `pixel` = row * [`TILE_COLUMNS`] + column, `length` in units of t.
     pub fn solve(
+        &mut self,
+        context: &TileContext,
+        w: &[f64],
+        c: &[Column],
+        found: impl FnMut(u32, usize, f64),
+    ) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") && !self.portable {
+            // Sound: the processor has what the function was compiled for.
+            #[allow(unsafe_code)]
+            return unsafe { self.solve_with_avx2(context, w, c, found) };
+        }
+        self.solve_anywhere(context, w, c, found);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
+    fn solve_with_avx2(
+        &mut self,
+        context: &TileContext,
+        w: &[f64],
+        c: &[Column],
+        found: impl FnMut(u32, usize, f64),
+    ) {
+        self.solve_anywhere(context, w, c, found);
+    }
+
+    #[inline(always)]
+    fn solve_anywhere(
         &mut self,
         context: &TileContext,
         w: &[f64],
         c: &[Column],
         mut found: impl FnMut(u32, usize, f64),
     ) {
-        let pixels = w.len() * c.len();
+        assert!(w.len() <= TILE_ROWS && c.len() == TILE_COLUMNS);
+        let pixels = w.len() * TILE_COLUMNS;
+        self.counters.rays += pixels as u64;
         self.rows.clear();
         self.rows.extend_from_slice(w);
         self.columns.clear();
         self.columns.extend_from_slice(c);
-        self.lists.resize_with(pixels.max(self.lists.len()), Vec::new);
-        self.lists.iter_mut().for_each(Vec::clear);
-        self.far.clear();
-        self.far.resize(pixels, [f64::INFINITY; BINS]);
-        self.tile_far = [f64::INFINITY; BINS];
-        self.tile_far_is_stale = false;
-        self.cuts.clear();
+        self.envelopes.clear(pixels);
+        self.row_far.clear();
+        self.row_far.resize(w.len(), Far::default());
+        self.tile_far = Far::default();
         self.seen_through.clear();
 
         self.walk(context, &context.geometry.occluders, Pass::Occluders);
-        self.walk(context, &context.geometry.see_through, Pass::SeeThrough);
+        if !context.geometry.see_through.instances.is_empty() {
+            self.walk(context, &context.geometry.see_through, Pass::SeeThrough);
+        }
+        #[cfg(debug_assertions)]
+        self.envelopes.assert_well_formed();
 
         for pixel in 0..pixels {
-            let shortest = context.bounds.shortest_interval(self.columns[pixel % c.len()].c);
-            let list = &self.lists[pixel];
-            self.counters.intervals += list.len() as u64;
-            for piece in list {
-                let length = piece.t1 - piece.t0;
+            let shortest = context.bounds.shortest_interval(self.columns[pixel % TILE_COLUMNS].c);
+            let mut intervals = 0;
+            self.envelopes.intervals(pixel, |primitive, length| {
+                intervals += 1;
                 if length > shortest {
-                    found(self.cuts[piece.cut as usize].primitive, pixel, length);
+                    found(primitive, pixel, length);
                 }
-            }
+            });
+            self.counters.intervals += intervals;
         }
         for &(primitive, pixel, length) in &self.seen_through {
             found(primitive, pixel as usize, length);
         }
     }
 
+    #[inline(always)]
     fn space(
         &self,
         context: &TileContext,
@@ -157,13 +229,14 @@ impl TileSolver {
         let (x, y, z) = (rows.x_axis, rows.y_axis, rows.z_axis);
         let (w_lo, w_hi) = (self.rows[0], self.rows[self.rows.len() - 1]);
         let (c_lo, c_hi) = (self.columns[0].c, self.columns[self.columns.len() - 1].c);
-        let normal = [y - w_lo * z, w_hi * z - y, x - c_lo * z, x - c_hi * z, z];
+        let normal = [y - w_lo * z, w_hi * z - y, x - c_lo * z, x - c_hi * z, z, y];
         let constant = [
             offset.y - w_lo * offset.z,
             w_hi * offset.z - offset.y,
             offset.x - c_lo * offset.z,
             offset.x - c_hi * offset.z,
             offset.z,
+            offset.y,
         ];
         // Rounding of a box test and of the vertices in the box: `depth` each, scaled by |c|.
         let slack = |c: f64| 2.0 * context.bounds.depth * (1.0 + c.abs());
@@ -173,13 +246,14 @@ impl TileSolver {
             constant[2] + slack(c_lo),
             constant[3] - slack(c_hi),
             constant[4],
+            constant[5],
         ];
         let extent = normal.map(DVec3::abs);
         Space { face_from_local, offset, instance, normal, extent, constant }
     }
 
     /// Tests a node against the beam; `None` when it is outside or hidden.
-    #[inline]
+    #[inline(always)]
     fn test(&mut self, context: &TileContext, space: u32, node: u32, of: &Node) -> Option<Entry> {
         self.counters.nodes += 1;
         let s = &self.spaces[space as usize];
@@ -196,6 +270,17 @@ impl TileSolver {
         if z + dz < -slack {
             return None;
         }
+        let zn = z - dz - slack;
+        if zn > 0.0 {
+            let (y, dy) = (middle(5), reach(5));
+            let (lo, hi) = (y - dy - slack, y + dy + slack);
+            let (a, b) = (1.0 / zn, 1.0 / (z + dz + slack));
+            let lo = if lo < 0.0 { lo * a } else { lo * b };
+            let hi = if hi < 0.0 { hi * b } else { hi * a };
+            if rows_met(&self.rows, (lo, hi)).is_empty() {
+                return None;
+            }
+        }
         let (first, last) = (middle(3) - reach(3), middle(2) + reach(2));
         // `first > last` only behind the camera: no ray of the beam gets there.
         if last < 0.0 || first > context.frame.length || first > last {
@@ -207,7 +292,7 @@ impl TileSolver {
 
     /// An entry for something no nearer than `near` that covers at most `first..last` along the
     /// segment (metres), unless it is hidden there in all pixels.
-    #[inline]
+    #[inline(always)]
     fn entry_if_not_hidden(
         &mut self,
         context: &TileContext,
@@ -223,23 +308,27 @@ impl TileSolver {
         (!self.is_hidden(&entry)).then_some(entry)
     }
 
-    #[inline]
+    #[inline(always)]
     fn is_hidden(&mut self, entry: &Entry) -> bool {
-        if self.tile_far_is_stale {
-            self.tile_far_is_stale = false;
-            let mut far = [f64::NEG_INFINITY; BINS];
-            for pixel in &self.far {
-                for (far, pixel) in far.iter_mut().zip(pixel) {
-                    *far = if *pixel > *far { *pixel } else { *far };
-                }
+        if self.tile_far.stale {
+            for row in 0..self.row_far.len() {
+                self.refresh_row(row);
             }
-            self.tile_far = far;
+            self.tile_far = Far::of(self.row_far.iter().map(|far| &far.depths));
         }
-        let bins = entry.first_bin as usize..=entry.last_bin as usize;
-        self.tile_far[bins].iter().all(|&far| entry.near > far)
+        self.tile_far.hides(entry.near, entry.first_bin, entry.last_bin)
+    }
+
+    #[inline(always)]
+    fn refresh_row(&mut self, row: usize) {
+        if self.row_far[row].stale {
+            let pixels = row * TILE_COLUMNS..(row + 1) * TILE_COLUMNS;
+            self.row_far[row] = Far::of(pixels.map(|pixel| self.envelopes.far(pixel)));
+        }
     }
 
     /// Walks both levels of a hierarchy front to back.
+    #[inline(always)]
     fn walk(&mut self, context: &TileContext, top: &TopLevel, pass: Pass) {
         let Some(root) = top.hierarchy.nodes.first() else { return };
         let geometry = context.geometry;
@@ -283,6 +372,7 @@ impl TileSolver {
     }
 
     /// Pushes the roots of instances, the nearest on top.
+    #[inline(always)]
     fn enter(&mut self, context: &TileContext, face_from_world: DMat3, ids: &[InstanceId]) {
         let bottom = self.stack.len();
         for &id in ids {
@@ -303,6 +393,7 @@ impl TileSolver {
         self.stack[bottom..].sort_by(|a, b| b.near.total_cmp(&a.near));
     }
 
+    #[inline(always)]
     fn leaf(
         &mut self,
         context: &TileContext,
@@ -314,65 +405,73 @@ impl TileSolver {
         let (matrix, offset) = (s.face_from_local, s.offset);
         let instance = &context.geometry.instances[s.instance.index()];
         let mesh = &context.geometry.meshes[instance.mesh.index()];
-        let (c_lo, c_hi) = (self.columns[0].c, self.columns[self.columns.len() - 1].c);
-        for item in items {
-            self.counters.triangles += 1;
-            let corners = mesh.corners(item).map(|p| matrix * p + offset);
-            let near = corners.iter().fold(f64::INFINITY, |m, p| m.min(p.z));
-            let last = corners.iter().fold(f64::NEG_INFINITY, |m, p| m.max(p.x - c_lo * p.z));
-            let first = corners.iter().fold(f64::INFINITY, |m, p| m.min(p.x - c_hi * p.z));
-            let slack = |c: f64| 2.0 * context.bounds.depth * (1.0 + c.abs());
-            let (first, last) = (first - slack(c_hi), last + slack(c_lo));
-            if last < 0.0 || first > context.frame.length || first > last {
-                continue;
-            }
-            let near = near - 2.0 * context.bounds.depth;
-            if self.entry_if_not_hidden(context, near, first, last, 0, 0).is_none() {
-                continue;
-            }
-            let primitive = instance.first_primitive.0 + item as u32;
-            for row in rows_met(&self.rows, &corners) {
-                let on_axis = context.bounds.depth;
-                if let Some(cut) = Cut::of_triangle(&corners, self.rows[row], on_axis, primitive) {
-                    self.counters.cuts += 1;
-                    self.row_cut(context, row, cut, pass);
+        let (c_lo, c_hi) = (self.columns[0].c, self.columns[TILE_COLUMNS - 1].c);
+        let slack = |c: f64| 2.0 * context.bounds.depth * (1.0 + c.abs());
+        let (slack_lo, slack_hi) = (slack(c_lo), slack(c_hi));
+        for start in items.clone().step_by(LANES) {
+            let lanes = LANES.min(items.end - start);
+            self.counters.triangles += lanes as u64;
+            let corners = FaceTriangles::new(mesh, start, lanes, &matrix, offset);
+            let extents = corners.extents(c_lo, c_hi);
+            for lane in 0..lanes {
+                let rows = rows_met(&self.rows, extents.rows(lane));
+                if rows.is_empty() {
+                    continue;
+                }
+                let (first, last) = (extents.first[lane] - slack_hi, extents.last[lane] + slack_lo);
+                if last < 0.0 || first > context.frame.length || first > last {
+                    continue;
+                }
+                let near = extents.near[lane] - 2.0 * context.bounds.depth;
+                let Some(entry) = self.entry_if_not_hidden(context, near, first, last, 0, 0) else {
+                    continue;
+                };
+                let triangle = corners.triangle(lane);
+                let primitive = instance.first_primitive.0 + (start + lane) as u32;
+                for row in rows {
+                    self.refresh_row(row);
+                    if self.row_far[row].hides(near, entry.first_bin, entry.last_bin) {
+                        continue;
+                    }
+                    let on_axis = context.bounds.depth;
+                    let cut = Cut::of_triangle(&triangle, self.rows[row], on_axis, primitive);
+                    if let Some(cut) = cut {
+                        self.counters.cuts += 1;
+                        self.row_cut(context, row, &cut, pass);
+                    }
                 }
             }
         }
     }
 
-    fn row_cut(&mut self, context: &TileContext, row: usize, cut: Cut, pass: Pass) {
-        let number = self.cuts.len() as u32;
-        let mut kept = false;
-        let nearest = cut.za.min(cut.zb) - 2.0 * context.bounds.depth;
-        let width = self.columns.len();
-        for (k, column) in self.columns.iter().enumerate() {
-            let (ta, tb) = cut.times(column.c, column.inverse_length);
-            let (a, b) = (ta.min(tb).max(0.0), ta.max(tb).min(1.0));
+    #[inline(always)]
+    fn row_cut(&mut self, context: &TileContext, row: usize, cut: &Cut, pass: Pass) {
+        let columns: &[Column; TILE_COLUMNS] =
+            self.columns[..].try_into().expect("a tile has TILE_COLUMNS columns");
+        let times = columns.map(|column| cut.times(column.c, column.inverse_length));
+        for (k, column) in columns.iter().enumerate() {
+            let (ta, tb) = times[k];
+            let (a, b) = (largest(least(ta, tb), 0.0), least(largest(ta, tb), 1.0));
             if a >= b {
                 continue;
             }
             self.counters.pixel_tests += 1;
-            let pixel = row * width + k;
-            let bin = |t: f64| ((t * BINS as f64) as usize).min(BINS - 1);
-            let bins = bin(a)..=bin(b);
-            if self.far[pixel][bins.clone()].iter().all(|&far| nearest > far) {
+            let pixel = row * TILE_COLUMNS + k;
+            let nearest = least(cut.za, cut.zb) - 2.0 * context.bounds.depth;
+            let bins = bin_of(a)..=bin_of(b);
+            if self.envelopes.far(pixel)[bins].iter().all(|&far| nearest > far) {
                 continue;
             }
-            let list = &mut self.lists[pixel];
+            let line = Line::new(cut, column, times[k]);
             match pass {
                 Pass::Occluders => {
-                    if !kept {
-                        self.cuts.push(cut);
-                        kept = true;
-                    }
-                    if envelope::insert(list, &mut self.scratch, &self.cuts, column, number, a, b) {
-                        refresh(&mut self.far[pixel], list, &self.cuts, column, bins);
-                        self.tile_far_is_stale = true;
+                    if self.envelopes.insert(pixel, line, a, b) {
+                        self.row_far[row].stale = true;
+                        self.tile_far.stale = true;
                     }
                 }
                 Pass::SeeThrough => {
-                    let seen = envelope::unhidden_length(list, &self.cuts, column, &cut, a, b);
+                    let seen = self.envelopes.unhidden_length(pixel, &line, a, b);
                     if seen > context.bounds.shortest_interval(column.c) {
                         self.seen_through.push((cut.primitive, pixel as u32, seen));
                     }
@@ -382,55 +481,101 @@ impl TileSolver {
     }
 }
 
+/// Up to [`LANES`] triangles in face coordinates; lanes beyond are copies of the last one.
+struct FaceTriangles {
+    /// Corner, axis, lane.
+    corners: [[[f64; LANES]; 3]; 3],
+}
+
+/// What decides whether the triangles of [`FaceTriangles`] can be seen, a lane each.
+struct Extents {
+    near: [f64; LANES],
+    /// Least x - c_hi z.
+    first: [f64; LANES],
+    /// Largest x - c_lo z.
+    last: [f64; LANES],
+    /// Least and largest y / z; everything when a corner is not in front.
+    w: [[f64; LANES]; 2],
+}
+
+impl Extents {
+    #[inline(always)]
+    fn rows(&self, lane: usize) -> (f64, f64) {
+        (self.w[0][lane], self.w[1][lane])
+    }
+}
+
+impl FaceTriangles {
+    #[inline(always)]
+    fn new(mesh: &Mesh, start: usize, lanes: usize, matrix: &DMat3, offset: DVec3) -> Self {
+        let mut local = [[[0.0f64; LANES]; 3]; 3];
+        for lane in 0..LANES {
+            let stored = mesh.stored_corners(start + lane.min(lanes - 1));
+            for (corner, stored) in local.iter_mut().zip(stored) {
+                for (axis, value) in corner.iter_mut().zip(stored) {
+                    axis[lane] = f64::from(value);
+                }
+            }
+        }
+        let (mx, my, mz) = (matrix.x_axis, matrix.y_axis, matrix.z_axis);
+        let mut corners = [[[0.0f64; LANES]; 3]; 3];
+        for (corner, local) in corners.iter_mut().zip(&local) {
+            for (axis, out) in corner.iter_mut().enumerate() {
+                for lane in 0..LANES {
+                    out[lane] = (mx[axis] * local[0][lane] + my[axis] * local[1][lane])
+                        + mz[axis] * local[2][lane]
+                        + offset[axis];
+                }
+            }
+        }
+        Self { corners }
+    }
+
+    #[inline(always)]
+    fn triangle(&self, lane: usize) -> [DVec3; 3] {
+        [0, 1, 2].map(|k| {
+            let p = &self.corners[k];
+            DVec3::new(p[0][lane], p[1][lane], p[2][lane])
+        })
+    }
+
+    #[inline(always)]
+    fn extents(&self, c_lo: f64, c_hi: f64) -> Extents {
+        let mut out = Extents {
+            near: [f64::INFINITY; LANES],
+            first: [f64::INFINITY; LANES],
+            last: [f64::NEG_INFINITY; LANES],
+            w: [[f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]],
+        };
+        let [w_least, w_largest] = &mut out.w;
+        for [x, y, z] in &self.corners {
+            for lane in 0..LANES {
+                out.near[lane] = least(out.near[lane], z[lane]);
+                out.first[lane] = least(out.first[lane], x[lane] - c_hi * z[lane]);
+                out.last[lane] = largest(out.last[lane], x[lane] - c_lo * z[lane]);
+                // A quotient that is no number belongs to a corner that is not in front.
+                let w = y[lane] / z[lane];
+                w_least[lane] = least(w_least[lane], w);
+                w_largest[lane] = largest(w_largest[lane], w);
+            }
+        }
+        for lane in 0..LANES {
+            if out.near[lane] <= 0.0 {
+                w_least[lane] = f64::NEG_INFINITY;
+                w_largest[lane] = f64::INFINITY;
+            }
+        }
+        out
+    }
+}
+
 /// The rows (ascending) whose plane may cut a triangle: those between the least and the largest
 /// y / z of its corners. The margin is some 1,000 times the rounding of either side, where |y| is
 /// of the size of z; where it is larger, the signs are beyond doubt.
-#[inline]
-fn rows_met(rows: &[f64], corners: &[DVec3; 3]) -> std::ops::Range<usize> {
-    if corners.iter().any(|p| p.z <= 0.0) {
-        return 0..rows.len();
-    }
-    let w = corners.map(|p| p.y / p.z);
-    let first = w[0].min(w[1]).min(w[2]) - 1e-12;
-    let last = w[0].max(w[1]).max(w[2]) + 1e-12;
-    let before = rows.iter().take_while(|&&w| w < first).count();
-    let behind = rows.iter().rev().take_while(|&&w| w > last).count();
+#[inline(always)]
+fn rows_met(rows: &[f64], (least, largest): (f64, f64)) -> std::ops::Range<usize> {
+    let (least, largest) = (least - 1e-12, largest + 1e-12);
+    let before = rows.iter().filter(|&&w| w < least).count();
+    let behind = rows.iter().filter(|&&w| w > largest).count();
     before..(rows.len() - behind).max(before)
-}
-
-/// Recomputes a pixel's bins: the farthest depth where the list covers a bin without a gap.
-fn refresh(
-    far: &mut [f64; BINS],
-    list: &[Interval],
-    cuts: &[Cut],
-    column: &Column,
-    bins: std::ops::RangeInclusive<usize>,
-) {
-    let first = list.partition_point(|p| p.t1 * BINS as f64 <= *bins.start() as f64);
-    let mut pieces = list[first..].iter().peekable();
-    for bin in bins {
-        let (start, end) = (bin as f64 / BINS as f64, (bin + 1) as f64 / BINS as f64);
-        let mut covered = start;
-        let mut farthest = f64::NEG_INFINITY;
-        while let Some(piece) = pieces.peek() {
-            if piece.t1 > start {
-                if piece.t0 > covered {
-                    break;
-                }
-                let line = Line::new(&cuts[piece.cut as usize], column);
-                let (s, e) = (piece.t0.max(start), piece.t1.min(end));
-                farthest = farthest.max(line.depth(s)).max(line.depth(e));
-                covered = piece.t1;
-                if covered >= end {
-                    break;
-                }
-            }
-            pieces.next();
-        }
-        far[bin] = if covered >= end {
-            farthest + column.depth_error + 4.0 * UNIT_ROUNDOFF * farthest
-        } else {
-            f64::INFINITY
-        };
-    }
 }
