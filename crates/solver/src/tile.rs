@@ -423,14 +423,18 @@ impl TileSolver {
                     continue;
                 }
                 let near = extents.near[lane] - 2.0 * context.bounds.depth;
-                let Some(entry) = self.entry_if_not_hidden(context, near, first, last, 0, 0) else {
+                if self.entry_if_not_hidden(context, near, first, last, 0, 0).is_none() {
                     continue;
-                };
+                }
                 let triangle = corners.triangle(lane);
+                let stretches = self.stretches(&triangle);
                 let primitive = instance.first_primitive.0 + (start + lane) as u32;
                 for row in rows {
-                    self.refresh_row(row);
-                    if self.row_far[row].hides(near, entry.first_bin, entry.last_bin) {
+                    let hidden = stretches.iter().enumerate().all(|(k, bins)| {
+                        let far = self.envelopes.far(row * TILE_COLUMNS + k);
+                        far[bins.clone()].iter().all(|&far| near > far)
+                    });
+                    if hidden {
                         continue;
                     }
                     let on_axis = context.bounds.depth;
@@ -442,6 +446,26 @@ impl TileSolver {
                 }
             }
         }
+    }
+
+    /// For each column, the bins that a triangle can meet; empty where it meets none.
+    #[inline(always)]
+    fn stretches(&self, triangle: &[DVec3; 3]) -> [std::ops::Range<usize>; TILE_COLUMNS] {
+        let (mut first, mut last) =
+            ([f64::INFINITY; TILE_COLUMNS], [f64::NEG_INFINITY; TILE_COLUMNS]);
+        let mut slack = [0.0; TILE_COLUMNS];
+        for (k, column) in self.columns.iter().enumerate() {
+            slack[k] = column.time_error * 4.0;
+            for p in triangle {
+                let t = (p.x - column.c * p.z) * column.inverse_length;
+                first[k] = least(first[k], t);
+                last[k] = largest(last[k], t);
+            }
+        }
+        std::array::from_fn(|k| {
+            let (first, last) = (first[k] - slack[k], last[k] + slack[k]);
+            if last < 0.0 || first > 1.0 { 0..0 } else { bin_of(first)..bin_of(last) + 1 }
+        })
     }
 
     #[inline(always)]
