@@ -1,0 +1,1 @@
+//! Closed meshes, which must not leak.
