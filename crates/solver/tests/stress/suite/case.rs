@@ -72,7 +72,11 @@ impl Pose {
 
     /// One of both.
     pub fn any(random: &mut Random, length: f64) -> Self {
-        if random.one_in(2) { Self::aligned(random, length) } else { Self::free(random, length, 1e3) }
+        if random.one_in(2) {
+            Self::aligned(random, length)
+        } else {
+            Self::free(random, length, 1e3)
+        }
     }
 }
 
@@ -129,7 +133,8 @@ impl Scene {
 
 /// A small grid of pixels, often with its rays off the centres.
 pub fn small_sampling(random: &mut Random) -> Sampling {
-    let (rows, columns) = random.pick(&[(4, 4), (4, 8), (8, 8), (8, 16), (16, 16), (16, 4), (4, 32)]);
+    let (rows, columns) =
+        random.pick(&[(4, 4), (4, 8), (8, 8), (8, 16), (16, 16), (16, 4), (4, 32)]);
     let sampling = Sampling::with_columns(rows, columns);
     if random.one_in(2) { sampling } else { sampling.jittered(random.below(1000) as u32) }
 }

@@ -5,9 +5,7 @@
 
 use dashu_ratio::RBig;
 use glam::DVec3;
-use sightline_geometry::{
-    InstancedGeometry, PrimitiveId, RectifiedFrame, Sampling, UNIT_ROUNDOFF,
-};
+use sightline_geometry::{InstancedGeometry, PrimitiveId, RectifiedFrame, Sampling, UNIT_ROUNDOFF};
 
 type V3 = [RBig; 3];
 
@@ -41,7 +39,10 @@ fn corners(geometry: &InstancedGeometry, primitive: u32) -> [V3; 3] {
     geometry.meshes[instance.mesh.index()].corners(local).map(|p| {
         let p = exact3(p);
         std::array::from_fn(|k| {
-            &columns[0][k] * &p[0] + &columns[1][k] * &p[1] + &columns[2][k] * &p[2] + &translation[k]
+            &columns[0][k] * &p[0]
+                + &columns[1][k] * &p[1]
+                + &columns[2][k] * &p[2]
+                + &translation[k]
         })
     })
 }

@@ -18,6 +18,7 @@
 
 pub mod case;
 pub mod closed;
+pub mod determinism;
 pub mod exact;
 pub mod families;
 pub mod random;

@@ -107,7 +107,7 @@ pub struct Pixel<'a> {
     pub row: u32,
     pub column: u32,
     pub seen: &'a [Seen],
-    /// True when something but the ends of intervals is open.
+    /// True when what is open could be seen in a comparison of sets or weights.
     pub undecided: bool,
 }
 
@@ -121,6 +121,9 @@ struct Triangle {
     /// Number of the set of three corners.
     shape: u32,
 }
+
+/// Weights are compared as `f32`: a smaller part of the segment does not show in them.
+const VISIBLE_DIFFERENCE: f64 = f32::EPSILON as f64;
 
 const NO_PLANE: u32 = u32::MAX;
 
@@ -173,6 +176,9 @@ impl Line {
 /// A triangle at one pixel: where it may be, where it is for certain, and how deep.
 struct Stretch {
     triangle: u32,
+    occluder: bool,
+    /// True when another stretch of the pixel lies in its plane.
+    has_ties: bool,
     possible: [f64; 2],
     certain: [f64; 2],
     /// Empty when the triangle most likely is not there.
@@ -388,7 +394,8 @@ impl<'a> Twin<'a> {
         for (number, triangle) in self.triangles.iter().enumerate() {
             let p = triangle.corners.map(|p| Self::in_face(face, p));
             let h = p.map(|p| p.y - w * p.z);
-            let may = h.map(|h| if self.coarse { [h >= 0.0, h < 0.0] } else { sides(h, side_error) });
+            let may =
+                h.map(|h| if self.coarse { [h >= 0.0, h < 0.0] } else { sides(h, side_error) });
             let first = work.variants.len();
             let (mut certain, mut sure_sides) = (true, true);
             for pattern in 0..8usize {
@@ -420,8 +427,8 @@ impl<'a> Twin<'a> {
         }
     }
 
-    /// Fills `work.seen` with what is seen at column `c` of the row that was cut. True when
-    /// something but ends is open.
+    /// Fills `work.seen` with what is seen at column `c` of the row that was cut. True when what is
+    /// open could be seen in a comparison of sets or weights.
     fn pixel(&self, c: f64, work: &mut Work) -> bool {
         work.stretches.clear();
         work.lines.clear();
@@ -437,33 +444,52 @@ impl<'a> Twin<'a> {
         work.stretches.sort_by(|a, b| a.possible[0].total_cmp(&b.possible[0]));
         self.borders(work);
         let shortest = self.bounds.shortest_interval(c);
-        let mut undecided = false;
+        self.mark_ties(&mut work.stretches);
         let mut entered = 0;
         work.active.clear();
         for k in 1..work.borders.len() {
             let (from, to) = (work.borders[k - 1], work.borders[k]);
-            let middle = 0.5 * (from + to);
             while entered < work.stretches.len() && work.stretches[entered].possible[0] <= from {
                 work.active.push(entered as u32);
                 entered += 1;
             }
-            let (stretches, lines) = (&mut work.stretches, &work.lines);
+            let stretches = &mut work.stretches;
             work.active.retain(|&i| stretches[i as usize].possible[1] > from);
-            undecided |= self.elementary(middle, to - from, shortest, stretches, lines, &mut work.flags, &work.active);
+            if work.active.is_empty() {
+                continue;
+            }
+            let moment = Moment { t: 0.5 * (from + to), length: to - from, shortest };
+            self.elementary(&moment, stretches, &work.lines, &mut work.here, &work.active);
         }
+        let mut undecided = false;
         for stretch in &mut work.stretches {
-            let occluder = self.triangles[stretch.triangle as usize].occluder;
-            stretch.end_certain_run(shortest, occluder);
-            stretch.end_possible_run(shortest, occluder);
-            if !occluder {
+            stretch.end_certain_run(shortest);
+            stretch.end_possible_run(shortest);
+            let seen = &mut stretch.seen;
+            if !stretch.occluder {
                 // Of a see-through primitive the sum counts.
-                let seen = &mut stretch.seen;
                 seen.certain_counted = if seen.certain > shortest { seen.certain } else { 0.0 };
                 seen.possible_counted = if seen.possible > shortest { seen.possible } else { 0.0 };
             }
+            let open = seen.possible_counted - seen.certain_counted;
+            undecided |= open > VISIBLE_DIFFERENCE
+                || seen.certain_counted == 0.0 && seen.possible_counted > 0.0;
             work.seen.push(stretch.seen);
         }
         undecided
+    }
+
+    /// Notes which stretches are tied to another one of the pixel.
+    fn mark_ties(&self, stretches: &mut [Stretch]) {
+        for i in 1..stretches.len() {
+            let (before, rest) = stretches.split_at_mut(i);
+            for other in before {
+                if self.share_a_plane(other, &rest[0]) {
+                    other.has_ties = true;
+                    rest[0].has_ties = true;
+                }
+            }
+        }
     }
 
     fn stretch(
@@ -507,6 +533,8 @@ impl<'a> Twin<'a> {
         let triangle = &self.triangles[cut.triangle as usize];
         Some(Stretch {
             triangle: cut.triangle,
+            occluder: triangle.occluder,
+            has_ties: false,
             possible,
             certain,
             likely,
@@ -556,153 +584,197 @@ impl<'a> Twin<'a> {
         borders.dedup();
     }
 
-    /// True when `a` is in front of `b` for certain, wherever both are.
-    fn is_before(&self, a: &Stretch, b: &Stretch, lines: &[Line], t: f64) -> bool {
-        let (one, other) = (&self.triangles[a.triangle as usize], &self.triangles[b.triangle as usize]);
-        if self.are_tied(a, b) {
-            return one.primitive < other.primitive;
-        }
-        let far = lines[a.lines.clone()].iter().map(|l| l.depth(t) + l.margin);
-        let near = lines[b.lines.clone()].iter().map(|l| l.depth(t) - l.margin);
-        far.fold(f64::NEG_INFINITY, f64::max) < near.fold(f64::INFINITY, f64::min)
+    /// True when the two lie in one plane, or are one triangle twice.
+    fn share_a_plane(&self, a: &Stretch, b: &Stretch) -> bool {
+        let (one, other) =
+            (&self.triangles[a.triangle as usize], &self.triangles[b.triangle as usize]);
+        one.shape == other.shape || one.plane == other.plane && one.plane != NO_PLANE
     }
 
     /// True when the solver must find the depths of both equal everywhere.
     fn are_tied(&self, a: &Stretch, b: &Stretch) -> bool {
-        let (one, other) = (&self.triangles[a.triangle as usize], &self.triangles[b.triangle as usize]);
-        one.shape == other.shape
-            || one.plane == other.plane
-                && one.plane != NO_PLANE
-                && a.keeps_to_plane
-                && b.keeps_to_plane
+        a.has_ties
+            && b.has_ties
+            && self.share_a_plane(a, b)
+            && (a.keeps_to_plane && b.keeps_to_plane
+                || self.triangles[a.triangle as usize].shape
+                    == self.triangles[b.triangle as usize].shape)
     }
 
-    /// Who is visible on a stretch of t on which nothing changes. True when that is open for
-    /// another reason than an end.
-    #[allow(clippy::too_many_arguments)]
+    /// True when `a` is in front of `b` for certain, where both are: an occluder before an
+    /// occluder, or before something see-through, which is not hidden by its equal.
+    fn is_before(&self, a: &Here, b: &Here, stretches: &[Stretch]) -> bool {
+        let (one, other) = (&stretches[a.stretch as usize], &stretches[b.stretch as usize]);
+        if self.are_tied(one, other) {
+            return match (one.occluder, other.occluder) {
+                (true, true) => one.seen.primitive < other.seen.primitive,
+                (true, false) => false,
+                (false, _) => true,
+            };
+        }
+        a.far < b.near
+    }
+
+    /// Who is visible on a stretch of t on which nothing changes.
     fn elementary(
         &self,
-        t: f64,
-        length: f64,
-        shortest: f64,
+        moment: &Moment,
         stretches: &mut [Stretch],
         lines: &[Line],
-        flags: &mut Vec<bool>,
+        here: &mut Vec<Here>,
         active: &[u32],
-    ) -> bool {
-        let covers = |range: [f64; 2]| range[0] <= t && t < range[1];
-        let is_occluder =
-            |i: u32| self.triangles[stretches[i as usize].triangle as usize].occluder;
-        let at = |i: u32| &stretches[i as usize];
-        let before = |i: u32, j: u32| self.is_before(at(i), at(j), lines, t);
-        let may = |i: u32| covers(at(i).possible);
-        let must = |i: u32| covers(at(i).certain);
-        let others = |i: u32| active.iter().copied().filter(move |&j| j != i);
-        let occluders = |i: u32| others(i).filter(|&j| is_occluder(j) && may(j));
-        // The front: see the top of the file.
-        flags.clear();
-        flags.extend(active.iter().map(|&i| {
-            is_occluder(i) && may(i) && !occluders(i).any(|j| must(j) && before(j, i))
-        }));
-        let all_are_in = active.iter().zip(flags.iter()).all(|(&i, &f)| f || !is_occluder(i) || !may(i));
-        let mut grows = !all_are_in;
+    ) {
+        here.clear();
+        let mut no_ties = true;
+        for &i in active {
+            let s = &stretches[i as usize];
+            let t = moment.t;
+            let covers = |range: [f64; 2]| range[0] <= t && t < range[1];
+            if !covers(s.possible) {
+                continue;
+            }
+            let (mut near, mut far) = (f64::INFINITY, f64::NEG_INFINITY);
+            for line in &lines[s.lines.clone()] {
+                let z = line.depth(t);
+                near = near.min(z - line.margin);
+                far = far.max(z + line.margin);
+            }
+            no_ties &= !s.has_ties;
+            here.push(Here {
+                stretch: i,
+                near,
+                far,
+                z: s.likely_line.depth(t),
+                must: covers(s.certain),
+                likely: covers(s.likely),
+                occluder: s.occluder,
+                front: false,
+            });
+        }
+        self.find_front(here, stretches, no_ties);
+        let covered = here.iter().any(|h| h.occluder && h.must);
+        for k in 0..here.len() {
+            let h = &here[k];
+            let possible = if h.occluder {
+                h.front
+            } else {
+                !covered || here.iter().any(|f| f.front && !self.is_before(f, h, stretches))
+            };
+            let rival = here
+                .iter()
+                .enumerate()
+                .find(|&(m, r)| m != k && r.occluder && !self.is_before(h, r, stretches))
+                .map(|(_, r)| r);
+            let certain = possible && h.must && rival.is_none();
+            let likely = h.likely && !self.is_likely_hidden(k, here, stretches);
+            let cause = match rival {
+                _ if !h.must => stretches[h.stretch as usize].cause,
+                None => Cause::End,
+                Some(r) if r.must => Cause::DepthTie,
+                Some(r) => stretches[r.stretch as usize].cause,
+            };
+            stretches[h.stretch as usize].note(moment, possible, certain, likely, cause);
+        }
+    }
+
+    /// Marks what the solver may hold: see the top of the file.
+    fn find_front(&self, here: &mut [Here], stretches: &[Stretch], no_ties: bool) {
+        if no_ties {
+            let certain = here.iter().filter(|h| h.occluder && h.must).map(|h| h.far);
+            let mut reach = certain.fold(f64::INFINITY, f64::min);
+            loop {
+                let mut farther = reach;
+                for h in here.iter_mut().filter(|h| h.occluder && !h.front && h.near <= reach) {
+                    h.front = true;
+                    farther = farther.max(h.far);
+                }
+                if farther == reach {
+                    return;
+                }
+                reach = farther;
+            }
+        }
+        for k in 0..here.len() {
+            let hidden = here.iter().enumerate().any(|(m, other)| {
+                m != k && other.occluder && other.must && self.is_before(other, &here[k], stretches)
+            });
+            here[k].front = here[k].occluder && !hidden;
+        }
+        let mut grows = true;
         while grows {
             grows = false;
-            for k in 0..active.len() {
-                let i = active[k];
-                if flags[k] || !is_occluder(i) || !may(i) {
+            for k in 0..here.len() {
+                if here[k].front || !here[k].occluder {
                     continue;
                 }
-                let joins = (0..active.len()).any(|m| flags[m] && !before(active[m], i));
-                if joins {
-                    flags[k] = true;
-                    grows = true;
-                }
+                let joins = here.iter().any(|f| f.front && !self.is_before(f, &here[k], stretches));
+                here[k].front |= joins;
+                grows |= joins;
             }
         }
-        let covered = active.iter().any(|&i| is_occluder(i) && must(i));
-        let key = |i: u32| {
-            let s = at(i);
-            (s.likely_line.depth(t), s.seen.primitive)
-        };
-        let likely_before = |i: u32, j: u32| {
-            let ((zi, pi), (zj, pj)) = (key(i), key(j));
-            let (one, other) =
-                (&self.triangles[at(i).triangle as usize], &self.triangles[at(j).triangle as usize]);
-            let tied = one.shape == other.shape || one.plane == other.plane && one.plane != NO_PLANE;
-            let pj = if is_occluder(i) && !is_occluder(j) { u32::MAX } else { pj };
-            if tied { pi < pj } else { (zi, pi) < (zj, pj) }
-        };
-        // What is found of each, and why it is open; applied below, as the closures borrow.
-        let mut open = false;
-        let answers: Vec<(u32, bool, bool, bool, Cause)> = active
-            .iter()
-            .enumerate()
-            .map(|(k, &i)| {
-                let occluder = is_occluder(i);
-                let possible = if occluder {
-                    flags[k]
-                } else {
-                    may(i) && (!covered || (0..active.len()).any(|m| flags[m] && !before(active[m], i)))
-                };
-                // A see-through primitive is seen when it ties with what is in front.
-                let stands_before =
-                    |j: u32| before(i, j) || !occluder && self.are_tied(at(i), at(j));
-                let rival = occluders(i).find(|&j| !stands_before(j));
-                let certain = possible && must(i) && rival.is_none();
-                let likely = possible
-                    && covers(at(i).likely)
-                    && !others(i).any(|j| {
-                        is_occluder(j) && covers(at(j).likely) && {
-                            let tied_glass = !occluder
-                                && self.triangles[at(i).triangle as usize].plane
-                                    == self.triangles[at(j).triangle as usize].plane
-                                && self.triangles[at(i).triangle as usize].plane != NO_PLANE;
-                            !tied_glass
-                                && if occluder { likely_before(j, i) } else { key(j).0 < key(i).0 }
-                        }
-                    });
-                let cause = if !must(i) {
-                    at(i).cause
-                } else {
-                    rival.map_or(Cause::End, |j| {
-                        if must(j) { Cause::DepthTie } else { at(j).cause }
-                    })
-                };
-                (i, possible, certain, likely, cause)
-            })
-            .collect();
-        for (i, possible, certain, likely, cause) in answers {
-            let occluder = self.triangles[stretches[i as usize].triangle as usize].occluder;
-            let s = &mut stretches[i as usize];
-            if likely {
-                s.seen.likely += length;
+    }
+
+    /// True when an occluder is most likely in front of number `k`.
+    fn is_likely_hidden(&self, k: usize, here: &[Here], stretches: &[Stretch]) -> bool {
+        let h = &here[k];
+        let own = &stretches[h.stretch as usize];
+        here.iter().enumerate().any(|(m, r)| {
+            if m == k || !r.occluder || !r.likely {
+                return false;
             }
-            if possible {
-                s.seen.possible += length;
-                s.run_possible += length;
-            } else {
-                s.end_possible_run(shortest, occluder);
-            }
-            if certain {
-                s.seen.certain += length;
-                s.run_certain += length;
-            } else {
-                s.end_certain_run(shortest, occluder);
-            }
-            if possible && !certain {
-                s.seen.open[cause as usize] += length;
-                open |= cause != Cause::End && length > shortest;
-            }
-        }
-        open
+            let rival = &stretches[r.stretch as usize];
+            let tied =
+                r.z == h.z || own.has_ties && rival.has_ties && self.share_a_plane(own, rival);
+            if tied { h.occluder && rival.seen.primitive < own.seen.primitive } else { r.z < h.z }
+        })
     }
 }
 
+/// A stretch of t on which nothing changes: its middle, its length, and the length up to which
+/// intervals are not counted.
+struct Moment {
+    t: f64,
+    length: f64,
+    shortest: f64,
+}
+
+/// A stretch at one t.
+struct Here {
+    stretch: u32,
+    near: f64,
+    far: f64,
+    z: f64,
+    must: bool,
+    likely: bool,
+    occluder: bool,
+    front: bool,
+}
+
 impl Stretch {
-    fn end_certain_run(&mut self, shortest: f64, occluder: bool) {
+    fn note(&mut self, moment: &Moment, possible: bool, certain: bool, likely: bool, cause: Cause) {
+        if likely {
+            self.seen.likely += moment.length;
+        }
+        if possible {
+            self.seen.possible += moment.length;
+            self.run_possible += moment.length;
+        } else {
+            self.end_possible_run(moment.shortest);
+        }
+        if certain {
+            self.seen.certain += moment.length;
+            self.run_certain += moment.length;
+        } else {
+            self.end_certain_run(moment.shortest);
+        }
+        if possible && !certain {
+            self.seen.open[cause as usize] += moment.length;
+        }
+    }
+
+    fn end_certain_run(&mut self, shortest: f64) {
         let run = std::mem::take(&mut self.run_certain);
-        if !occluder || run == 0.0 {
+        if !self.occluder || run == 0.0 {
             return;
         }
         // The sum of a run is off by a rounding a border; `shortest` is at least 64 u, so a
@@ -714,9 +786,9 @@ impl Stretch {
         }
     }
 
-    fn end_possible_run(&mut self, shortest: f64, occluder: bool) {
+    fn end_possible_run(&mut self, shortest: f64) {
         let run = std::mem::take(&mut self.run_possible);
-        if occluder && run > shortest * (1.0 - 1.0 / f64::from(1 << 20)) {
+        if self.occluder && run > shortest * (1.0 - 1.0 / f64::from(1 << 20)) {
             self.seen.possible_counted += run;
         }
     }
@@ -736,12 +808,7 @@ fn edge_end(p: DVec3, q: DVec3, hp: f64, hq: f64, side_error: f64) -> End {
         1.0
     };
     let (x, z) = (q.x - p.x, q.z - p.z);
-    End {
-        x: p.x + lambda * x,
-        z: p.z + lambda * z,
-        slide_x: slide * x,
-        slide_z: slide * z,
-    }
+    End { x: p.x + lambda * x, z: p.z + lambda * z, slide_x: slide * x, slide_z: slide * z }
 }
 
 /// Adds the variants of a cut after clipping at z = 0. True when it certainly has one.
@@ -774,8 +841,7 @@ fn clip(a: End, b: End, depth: f64, likely: bool, out: &mut Vec<Variant>) -> boo
                     (0.5, 1.0)
                 };
                 let x = behind.x - front.x;
-                let slide_x =
-                    (slide * x).abs() + front.slide_x.abs().max(behind.slide_x.abs());
+                let slide_x = (slide * x).abs() + front.slide_x.abs().max(behind.slide_x.abs());
                 let on_axis = End { x: front.x + lambda * x, z: 0.0, slide_x, slide_z: 0.0 };
                 let front = End { z: front.z.max(0.0), ..front };
                 out.push(Variant { a: front, b: on_axis, likely });
@@ -819,7 +885,12 @@ impl Placed {
             // Where the end is on the axis, z stays 0 and only t moves: to either side.
             let off_plane = 2.0 * off(&a, sa).max(off(&b, sb));
             let (low, high) = (a.slide_z.abs().max(b.slide_z.abs()), bounds.depth);
-            (3.0 * (bounds.depth + off_plane + by_time), off_plane, near - low - high, far + low + high)
+            (
+                3.0 * (bounds.depth + off_plane + by_time),
+                off_plane,
+                near - low - high,
+                far + low + high,
+            )
         } else {
             let all = range + a.slide_z.abs().max(b.slide_z.abs());
             (3.0 * (bounds.depth + all), f64::INFINITY, near, far)
@@ -853,7 +924,7 @@ struct Work {
     lines: Vec<Line>,
     borders: Vec<f64>,
     active: Vec<u32>,
-    flags: Vec<bool>,
+    here: Vec<Here>,
     seen: Vec<Seen>,
 }
 

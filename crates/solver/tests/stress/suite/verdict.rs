@@ -9,7 +9,9 @@ use sightline_solver::{SegmentVisibility, solve_segment};
 
 use super::{
     case::Case,
+    closed::{ClosedFamily, leaks},
     exact,
+    families::Family,
     random::Random,
     twin::{CAUSES, Pixel, Seen, Twin, describe, share},
 };
@@ -84,7 +86,7 @@ fn rounded(weight: f64) -> f64 {
 }
 
 /// At most this many undecided pixels of a case are solved exactly for one primitive.
-const EXACT_PIXELS_MAX: usize = 64;
+const EXACT_PIXELS_MAX: usize = 16;
 
 /// A random number decides which pixels are solved exactly although nothing is in doubt: one case
 /// in this many, one pixel each.
@@ -194,7 +196,8 @@ fn settle(
         if (value - likely).abs() <= weight.slack() + rounded(likely) {
             tally.settled += 1;
         } else {
-            let largest = (0..CAUSES.len()).max_by(|&a, &b| weight.open[a].total_cmp(&weight.open[b]));
+            let largest =
+                (0..CAUSES.len()).max_by(|&a, &b| weight.open[a].total_cmp(&weight.open[b]));
             tally.explained[largest.expect("there are causes")] += 1;
         }
     }
@@ -240,4 +243,24 @@ fn compare_with_exact(
             ));
         }
     }
+}
+
+/// Runs and judges the case of a family with a number.
+pub fn run(family: &Family, seed: u64) -> Tally {
+    let mut random = Random::of_case(family.name, seed);
+    let case = (family.generate)(&mut random);
+    let mut tally = judge(&case, &mut random);
+    for line in &mut tally.unexplained {
+        *line = format!("--family {} --seed {seed}: {line}", family.name);
+    }
+    tally
+}
+
+/// Runs the case of a closed family with a number, and looks for leaks.
+pub fn run_closed(family: &ClosedFamily, seed: u64) -> Tally {
+    let case = (family.generate)(&mut Random::of_case(family.name, seed));
+    let found = solve_segment(&case.geometry, &case.segment, case.sampling);
+    let name = |leak: String| format!("--family {} --seed {seed}: {leak}", family.name);
+    let unexplained = leaks(&case, &found).into_iter().map(name).collect();
+    Tally { cases: 1, pixels: case.pixels(), unexplained, ..Tally::default() }
 }
