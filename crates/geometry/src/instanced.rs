@@ -95,6 +95,16 @@ impl Placement {
     }
 }
 
+/// `|M| |p|` of the mesh's vertex that is farthest from its origin on every axis.
+fn placement_reach(mesh: &Mesh, instance: &Instance) -> f64 {
+    if mesh.bounds.is_empty() {
+        return 0.0;
+    }
+    let far = mesh.bounds.min.abs().max(mesh.bounds.max.abs());
+    let m = instance.world_from_mesh.matrix3;
+    (m.x_axis.abs() * far.x + m.y_axis.abs() * far.y + m.z_axis.abs() * far.z).length()
+}
+
 /// Most instances whose placements are kept, which bounds the table to 96 MiB; a meadow of
 /// millions of instances inverts a transform where a ray meets its box.
 const PLACEMENTS_MAX: usize = 1 << 20;
@@ -124,6 +134,11 @@ pub struct InstancedGeometry {
     pub see_through: TopLevel,
     /// World box of everything.
     pub bounds: Bounds,
+    /// Largest `|M| |p|` over all instances and the vertices p of their meshes, M the linear part of
+    /// the transform, absolute values entry by entry; metres. A vertex is placed by products of
+    /// that size, so it can be off by that many roundings even if the sum is close to the viewer:
+    /// that is so for meshes that stand far from their own origin.
+    pub placement_reach: f64,
     /// One placement an instance, or none at all above [`PLACEMENTS_MAX`] instances.
     placements: Vec<Placement>,
 }
@@ -146,6 +161,10 @@ impl InstancedGeometry {
             .map(|i| meshes[i.mesh.index()].bounds.transformed(&i.world_from_mesh))
             .collect();
         let bounds = boxes.iter().fold(Bounds::EMPTY, |b, x| b.union(*x));
+        let placement_reach = instances
+            .iter()
+            .map(|i| placement_reach(&meshes[i.mesh.index()], i))
+            .fold(0.0, f64::max);
         let origin = if bounds.is_empty() { DVec3::ZERO } else { bounds.center().round() };
         let top_level = |occluder: bool| {
             let chosen: Vec<usize> = (0..instances.len())
@@ -165,7 +184,16 @@ impl InstancedGeometry {
         let (occluders, see_through) = (top_level(true), top_level(false));
         let kept = if instances.len() <= PLACEMENTS_MAX { instances.as_slice() } else { &[] };
         let placements = kept.iter().map(Placement::of).collect();
-        Self { origin, meshes, instances, occluders, see_through, bounds, placements }
+        Self {
+            origin,
+            meshes,
+            instances,
+            occluders,
+            see_through,
+            bounds,
+            placement_reach,
+            placements,
+        }
     }
 
     /// The way from world space into the space of an instance's mesh.

@@ -1,23 +1,26 @@
 //! The error bounds of the solver, derived once and used by every comparison.
 //!
 //! Let u be the unit roundoff and S a bound on |P - v0| over the scene, so that every face
-//! coordinate x, y, z of a vertex is at most S.
+//! coordinate x, y, z of a vertex is at most S. Let R be the geometry's `placement_reach`: a vertex
+//! is `M p + T`, and `|M| |p|` is at most R. For meshes that stand far from their own origin R is
+//! larger than S, and T cancels it.
 //!
 //! - *Vertex*: `x = m . p + b` with a composed matrix row m (3 products of 3 terms: 5 roundings
-//!   an entry) and offset b (T - v0 and 3 products: 6), then 3 products and 3 sums: the error is
-//!   at most gamma(12) S.
+//!   an entry) and offset b (T - v0 and 3 products: 6), then 3 products and 3 sums. The terms of
+//!   m . p add up to at most R, since m is a unit vector times M; those of b to at most
+//!   |T - v0| <= S + R. The error is at most gamma(12) (S + 2 R).
 //! - *Cut*: h = y - w z adds 2 roundings; lambda = hP / (hP - hQ) is a convex weight; its error
 //!   moves the cut point along the edge, by at most the error of h over the edge's slope against
 //!   the row plane. Along the edge that is a point of the true triangle displaced *within* the
-//!   edge's own line, so the cut stays within gamma(12) S of the true edge, plus gamma(4) S for
-//!   the interpolation: gamma(16) S off the line in all.
-//! - *Depth*: z of a cut at t is interpolated between its ends: gamma(16) S + 4 u S, and the
-//!   error of t times the slope of the cut.
-//! - *Time*: t = (x - c z) / L: (gamma(16) S (1 + |c|) + 3 u S (1 + |c|)) / L.
+//!   edge's own line, so the cut stays within gamma(12) (S + 2 R) of the true edge, plus gamma(4) S
+//!   for the interpolation: gamma(16) S + gamma(24) R off the line in all.
+//! - *Depth*: z of a cut at t is interpolated between its ends: 4 u S more, and the error of t
+//!   times the slope of the cut.
+//! - *Time*: t = (x - c z) / L: (gamma(19) S + gamma(24) R) (1 + |c|) / L.
 //!
-//! Both constants are rounded up to gamma(32), which leaves room for the second-order terms.
+//! All are rounded up to gamma(32) (S + R), which leaves room for the second-order terms.
 
-use sightline_geometry::{Bounds, RectifiedFrame, gamma};
+use sightline_geometry::{InstancedGeometry, RectifiedFrame, gamma};
 
 /// Bounds on the rounding errors of one segment's solve.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,14 +32,14 @@ pub struct ErrorBounds {
 }
 
 impl ErrorBounds {
-    /// The bounds for a scene box and a segment's frame.
+    /// The bounds for a scene and a segment's frame.
     #[must_use]
-    pub fn new(scene: Bounds, frame: &RectifiedFrame) -> Self {
-        let reach = if scene.is_empty() {
+    pub fn new(scene: &InstancedGeometry, frame: &RectifiedFrame) -> Self {
+        let reach = if scene.bounds.is_empty() {
             frame.length
         } else {
-            let far = (scene.min - frame.v0).abs().max((scene.max - frame.v0).abs());
-            far.length() + frame.length
+            let (min, max) = (scene.bounds.min - frame.v0, scene.bounds.max - frame.v0);
+            min.abs().max(max.abs()).length() + frame.length + scene.placement_reach
         };
         let depth = gamma(32) * reach;
         Self { depth, time_per_column: depth / frame.length }

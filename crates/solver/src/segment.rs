@@ -198,7 +198,7 @@ pub fn solve_segment_with(
     options: &SolveOptions,
 ) -> SegmentVisibility {
     let Some(frame) = RectifiedFrame::new(segment) else { return SegmentVisibility::default() };
-    let bounds = ErrorBounds::new(geometry.bounds, &frame);
+    let bounds = ErrorBounds::new(geometry, &frame);
     let threshold = (options.threshold.clamp(0.0, 1.0) * WEIGHT_UNIT) as u64;
 
     let mut grid = Grid::new(sampling, &frame, &bounds);

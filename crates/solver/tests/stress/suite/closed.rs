@@ -80,7 +80,7 @@ pub fn leaks(case: &Case, found: &SegmentVisibility) -> Vec<String> {
         let whole: f64 = members().map(|(_, w)| f64::from(*w)).sum();
         // Weights are rounded to `f32`, and a pixel may have dropped one interval a triangle.
         let frame = RectifiedFrame::new(&case.segment).expect("the segment has a length");
-        let bounds = ErrorBounds::new(case.geometry.bounds, &frame);
+        let bounds = ErrorBounds::new(&case.geometry, &frame);
         let c = case.sampling.column(case.sampling.columns() - 1).abs();
         let c = c.max(case.sampling.column(0).abs());
         let dropped = f64::from(case.geometry.primitive_count()) * bounds.shortest_interval(c);

@@ -433,15 +433,18 @@ fn fan(random: &mut Random) -> Case {
     let length = random.within(0.5..4.0);
     let pose = Pose::any(random, length);
     let mut scene = Scene::default();
-    let count = random.magnitude(100.0..3000.0) as u32;
+    // A crumpled fan is deep at its tip, and the twin quadratic in that: large ones are cones.
+    let crumpled = random.one_in(2);
+    let most = if crumpled { 120.0 } else { 3000.0 };
+    let count = random.magnitude(20.0..most) as u32;
     let tip = random.in_cube(5.0);
     let turn = random.rotation();
     let lift = random.within(-1.0..1.0);
     let mut positions = vec![tip];
     for i in 0..count {
         let angle = std::f64::consts::TAU * f64::from(i) / f64::from(count);
-        let rim = DVec3::new(libm::cos(angle), libm::sin(angle), lift * random.unit());
-        positions.push(tip + turn * rim * 6.0);
+        let height = lift * if crumpled { random.unit() } else { 1.0 };
+        positions.push(tip + turn * DVec3::new(libm::cos(angle), libm::sin(angle), height) * 6.0);
     }
     let wheel: Vec<[u32; 3]> = (0..count).map(|i| [0, 1 + i, 1 + (i + 1) % count]).collect();
     scene.add(&positions, &wheel, pose.world_from_face, true);

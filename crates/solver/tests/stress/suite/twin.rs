@@ -335,7 +335,7 @@ fn sides(v: f64, error: f64) -> [bool; 2] {
 impl<'a> Twin<'a> {
     pub fn new(case: &'a Case) -> Option<Self> {
         let frame = RectifiedFrame::new(&case.segment)?;
-        let bounds = ErrorBounds::new(case.geometry.bounds, &frame);
+        let bounds = ErrorBounds::new(&case.geometry, &frame);
         let face = frame.face(0);
         let axes = [face.axis, face.forward, face.up];
         let mut triangles = Vec::new();
@@ -481,6 +481,9 @@ impl<'a> Twin<'a> {
 
     /// Notes which stretches are tied to another one of the pixel.
     fn mark_ties(&self, stretches: &mut [Stretch]) {
+        if self.triangles.len() > PLANES_MAX {
+            return;
+        }
         for i in 1..stretches.len() {
             let (before, rest) = stretches.split_at_mut(i);
             for other in before {

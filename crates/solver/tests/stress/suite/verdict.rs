@@ -88,6 +88,9 @@ fn rounded(weight: f64) -> f64 {
 /// At most this many undecided pixels of a case are solved exactly for one primitive.
 const EXACT_PIXELS_MAX: usize = 16;
 
+/// The exact twin is cubic in the primitives of a pixel; pixels with more are left as they are.
+const EXACT_PRIMITIVES_MAX: usize = 64;
+
 /// A random number decides which pixels are solved exactly although nothing is in doubt: one case
 /// in this many, one pixel each.
 const SPOT_CHECK_ONE_IN: usize = 64;
@@ -176,6 +179,7 @@ fn settle(
     let mut solved = 0;
     twin.visit(|pixel| {
         let concerned = pixel.undecided
+            && pixel.seen.len() <= EXACT_PRIMITIVES_MAX
             && pixel.seen.iter().any(|s| s.possible > s.certain && doubtful.contains(&s.primitive));
         if !concerned || solved >= EXACT_PIXELS_MAX {
             return;
@@ -215,6 +219,9 @@ fn solve_exactly(case: &Case, twin: &Twin, pixel: &Pixel, tally: &mut Tally) -> 
 
 /// Looks at all primitives, also at those that the float twin says are not at the pixel.
 fn spot_check(case: &Case, twin: &Twin, pixel: &Pixel, tally: &mut Tally) {
+    if case.geometry.primitive_count() as usize > EXACT_PRIMITIVES_MAX {
+        return;
+    }
     tally.exact += 1;
     let all: Vec<u32> = (0..case.geometry.primitive_count()).collect();
     let address = (pixel.face, pixel.row, pixel.column);
