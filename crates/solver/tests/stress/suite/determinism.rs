@@ -49,7 +49,9 @@ pub fn shuffled(case: &Case, random: &mut Random) -> Shuffled {
     Shuffled { case, before }
 }
 
-/// The case with every triangle in an instance of its own: same numbers, another hierarchy.
+/// The case with every triangle in an instance of its own: same numbers, another hierarchy. Error
+/// bounds are those of the boxes of instances, so behind them come triangles without area, from
+/// corner to corner of the boxes that were there: nothing is seen of them, and the bounds stay.
 pub fn taken_apart(case: &Case) -> Case {
     let geometry = &case.geometry;
     let (mut meshes, mut instances) = (Vec::new(), Vec::new());
@@ -67,6 +69,21 @@ pub fn taken_apart(case: &Case) -> Case {
                 occluder: instance.occluder,
             });
         }
+    }
+    let count = geometry.primitive_count();
+    let with_triangles =
+        geometry.instances.iter().filter(|i| !geometry.meshes[i.mesh.index()].bounds.is_empty());
+    for (primitive, instance) in (count..).zip(with_triangles) {
+        let bounds = geometry.meshes[instance.mesh.index()].bounds;
+        let corners = [bounds.min, bounds.max].map(|p| p.as_vec3().to_array()).to_vec();
+        meshes.push(Mesh::new(corners, &[[0, 1, 1]]).0);
+        instances.push(Instance {
+            mesh: MeshId(primitive),
+            object: ObjectId(primitive),
+            world_from_mesh: instance.world_from_mesh,
+            first_primitive: PrimitiveId(primitive),
+            occluder: instance.occluder,
+        });
     }
     Case {
         geometry: InstancedGeometry::new(meshes, instances),
