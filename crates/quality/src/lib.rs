@@ -23,6 +23,7 @@ mod measure;
 mod membership;
 mod seed;
 
+pub use depth_tie::ties;
 pub use measure::{
     CellError, ViewpointError, measure_cell, measure_viewpoint, measure_viewpoints,
     random_viewpoints,
