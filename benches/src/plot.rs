@@ -81,7 +81,8 @@ pub fn draw(
         for (k, curve) in curves.iter().enumerate() {
             let color = COLORS[k % COLORS.len()];
             let style = color.stroke_width(if k == 0 { 3 } else { 2 });
-            let line: Vec<(f64, f64)> = curve.points.iter().map(|p| (p.seconds, value(p))).collect();
+            let line: Vec<(f64, f64)> =
+                curve.points.iter().map(|p| (p.seconds, value(p))).collect();
             chart
                 .draw_series(LineSeries::new(line.iter().copied(), style))?
                 .label(&curve.method)

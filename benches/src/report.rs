@@ -75,6 +75,50 @@ fn per_cent(v: f64) -> String {
     format!("{} %", digits(100.0 * v))
 }
 
+/// What is claimed, and what was measured, over all scenes.
+#[must_use]
+pub fn claims(scenes: &[SceneReport]) -> String {
+    let mut out = String::new();
+    let _ = writeln!(out, "| scene | claim | measured | holds |");
+    let _ = writeln!(out, "| --- | --- | --- | --- |");
+    let mut add = |scene: &str, claim: &str, measured: String, holds: Option<bool>| {
+        let holds = holds.map_or("not settled", |h| if h { "yes" } else { "no" });
+        let _ = writeln!(out, "| {scene} | {claim} | {measured} | {holds} |");
+    };
+    for SceneReport { name, curves, single, floor, .. } in scenes {
+        for s in single {
+            let rows = s.rows;
+            let ratio = s.from_segment / s.from_point;
+            let claim = format!("{rows} rows cost at most one from-point run over as many rays");
+            add(name, &claim, format!("{} times", digits(ratio)), Some(ratio <= 1.0));
+            for (kind, race) in [("the same", &s.same), ("fresh", &s.fresh)] {
+                let claim = format!("{rows} rows, equal time, {kind} directions: at most 80 %");
+                let share = race.share_at_equal_time;
+                add(name, &claim, per_cent(share), Some(share <= 0.8));
+                let claim = format!("{rows} rows, equal quality, {kind} directions: 500 times");
+                match race.time_to_share[3] {
+                    Some(time) => {
+                        add(name, &claim, format!("{} times", digits(time)), Some(time >= 500.0))
+                    }
+                    None => {
+                        let measured = format!("more than {} times", digits(race.stopped));
+                        add(name, &claim, measured, (race.stopped >= 500.0).then_some(true));
+                    }
+                }
+            }
+        }
+        let below = points_below(curves, *floor);
+        let mut methods: Vec<&str> = below.iter().map(|b| b.0.as_str()).collect();
+        methods.dedup();
+        let measured = match methods.as_slice() {
+            [] => "none is".to_owned(),
+            methods => format!("{} points of {}", below.len(), methods.join("; ")),
+        };
+        add(name, "no rival is below our curve", measured, Some(below.is_empty()));
+    }
+    out + "\n"
+}
+
 /// The section of a scene.
 #[must_use]
 pub fn section(scene: &SceneReport) -> String {
@@ -85,7 +129,8 @@ pub fn section(scene: &SceneReport) -> String {
     let _ = writeln!(out, "| tracer | frames | own viewpoint a ray | random order | build |");
     let _ = writeln!(out, "| --- | --- | --- | --- | --- |");
     for t in tracers {
-        let [frames, scattered, random] = [t.frames, t.scattered, t.random].map(|v| digits(v / 1e6));
+        let [frames, scattered, random] =
+            [t.frames, t.scattered, t.random].map(|v| digits(v / 1e6));
         let build = digits(t.build);
         let _ = writeln!(out, "| {} | {frames} | {scattered} | {random} | {build} s |", t.tracer);
     }
@@ -97,7 +142,8 @@ pub fn section(scene: &SceneReport) -> String {
         for p in &curve.points {
             let (mean, worst) = (per_cent(p.error.mean), per_cent(p.error.worst));
             let (method, label, time) = (&curve.method, &p.label, digits(p.seconds));
-            let _ = writeln!(out, "| {method} | {label} | {time} s | {} | {mean} | {worst} |", p.found);
+            let _ =
+                writeln!(out, "| {method} | {label} | {time} s | {} | {mean} | {worst} |", p.found);
         }
         if let Some(why) = &curve.ended {
             let _ = writeln!(out, "| {} | {why} | | | | |", curve.method);
@@ -116,7 +162,10 @@ pub fn section(scene: &SceneReport) -> String {
         }
     }
     if !single.is_empty() {
-        let _ = writeln!(out, "\nOne segment against as many rays from one of its points, and against from-point sampling:\n");
+        let _ = writeln!(
+            out,
+            "\nOne segment against as many rays from one of its points, and against from-point sampling:\n"
+        );
         let _ = write!(out, "{}", crate::single_segment::table(single));
     }
     let _ = writeln!(out);

@@ -225,9 +225,12 @@ pub fn table(all: &[SingleSegment]) -> String {
     let _ = writeln!(out, "|{}", " --- |".repeat(13));
     for s in all {
         for (kind, race) in [("the same", &s.same), ("fresh", &s.fresh)] {
-            let times = race
-                .time_to_share
-                .map(|t| t.map_or_else(|| format!("> {} x", digits(race.stopped)), |t| format!("{} x", digits(t))));
+            let times = race.time_to_share.map(|t| {
+                t.map_or_else(
+                    || format!("> {} x", digits(race.stopped)),
+                    |t| format!("{} x", digits(t)),
+                )
+            });
             let _ = writeln!(
                 out,
                 "| {} | {} | {} ms | {} ms, {} | {} | {} | {kind} | {} % | {} | {} % after {} x |",
@@ -267,7 +270,8 @@ mod tests {
         assert_eq!(directions.len(), 4 * 24 * 24);
         let tracer = Caster::new(&geometry, v0);
         let found = Found::new(400);
-        let mut runs = SameDirections { tracer: &tracer, segment, directions: &directions, found, runs: 0 };
+        let mut runs =
+            SameDirections { tracer: &tracer, segment, directions: &directions, found, runs: 0 };
         let mut counts = Vec::new();
         for _ in 0..256 {
             runs.step();

@@ -58,7 +58,8 @@ impl Truth {
                     let mut seen = Vec::new();
                     for i in piece * CHUNK..rays.min((piece + 1) * CHUNK) {
                         let (x, y) = morton(i);
-                        let mut jitter = |k: u32| (f64::from(k) + random.next_unit()) / f64::from(side);
+                        let mut jitter =
+                            |k: u32| (f64::from(k) + random.next_unit()) / f64::from(side);
                         let direction = rotation * sphere(jitter(x), jitter(y));
                         let ray = Ray { origin: viewpoints[viewpoint], direction };
                         nearest(geometry, caster, ray, &mut seen);
@@ -83,7 +84,8 @@ impl Truth {
         let members = Members::new(set, primitives);
         let of = |seen: &Vec<u32>| {
             let rays = seen.split_inclusive(|p| p & LAST != 0);
-            let is_wrong = |ray: &&[u32]| !ray.iter().any(|p| members.contains(PrimitiveId(p & !LAST)));
+            let is_wrong =
+                |ray: &&[u32]| !ray.iter().any(|p| members.contains(PrimitiveId(p & !LAST)));
             rays.filter(is_wrong).count() as f64 / f64::from(self.rays)
         };
         let errors: Vec<f64> = self.viewpoints.par_iter().map(of).collect();

@@ -19,7 +19,7 @@ use sightline_benches::curve::{Curve, Judge};
 use sightline_benches::directions::{sphere, stream};
 use sightline_benches::plot::{self, Axis};
 use sightline_benches::region::Region;
-use sightline_benches::report::{SceneReport, TracerSpeed, section};
+use sightline_benches::report::{SceneReport, TracerSpeed, claims, section};
 use sightline_benches::rivals::from_point::{Batches, FromPoint, Viewpoints};
 use sightline_benches::rivals::{algorithm_one, guided};
 use sightline_benches::tracers::{self, LocalRay, Tracer};
@@ -139,6 +139,25 @@ fn main() -> ExitCode {
 fn run(arguments: &Arguments) -> Result<(), String> {
     let folder = &arguments.out;
     std::fs::create_dir_all(folder).map_err(|e| format!("{}: {e}", folder.display()))?;
+    let mut reports = Vec::new();
+    for place in &arguments.scenes {
+        let report = compare(arguments, place)?;
+        for (axis, name) in [(Axis::Error, "error"), (Axis::Found, "found")] {
+            let path = folder.join(format!("{}-{name}.svg", place.name));
+            plot::draw(&path, &place.name, &report.curves, axis, report.floor)?;
+        }
+        reports.push(report);
+        // After every scene, so that a long run can be looked at.
+        let path = folder.join("compare.md");
+        let text = page(arguments, &reports);
+        std::fs::write(&path, text).map_err(|e| format!("{}: {e}", path.display()))?;
+    }
+    print!("{}", page(arguments, &reports));
+    Ok(())
+}
+
+/// The whole page.
+fn page(arguments: &Arguments, reports: &[SceneReport]) -> String {
     let clock = match arguments.clock {
         Clock::Wall => "on the wall",
         Clock::Processor => "of the processor, over the number of threads",
@@ -149,19 +168,9 @@ fn run(arguments: &Arguments) -> Result<(), String> {
         arguments.viewpoints,
         arguments.rays,
     );
-    for place in &arguments.scenes {
-        let report = compare(arguments, place)?;
-        for (axis, name) in [(Axis::Error, "error"), (Axis::Found, "found")] {
-            let path = folder.join(format!("{}-{name}.svg", place.name));
-            plot::draw(&path, &place.name, &report.curves, axis, report.floor)?;
-        }
-        page += &section(&report);
-        // After every scene, so that a long run can be looked at.
-        let path = folder.join("compare.md");
-        std::fs::write(&path, &page).map_err(|e| format!("{}: {e}", path.display()))?;
-    }
-    print!("{page}");
-    Ok(())
+    page += &claims(reports);
+    reports.iter().for_each(|r| page += &section(r));
+    page
 }
 
 /// The scene with every instance an occluder: no rival knows see-through ones.
@@ -186,8 +195,7 @@ fn compare(arguments: &Arguments, place: &Place) -> Result<SceneReport, String> 
     let truth = Truth::trace(geometry, &region.viewpoints(arguments.viewpoints), arguments.rays);
     let floor = 0.5 / (f64::from(truth.rays()) * f64::from(arguments.viewpoints.max(1)));
     let primitives = geometry.primitive_count();
-    let judge =
-        Judge { truth: &truth, primitives, clock: arguments.clock, limit: arguments.limit };
+    let judge = Judge { truth: &truth, primitives, clock: arguments.clock, limit: arguments.limit };
     say("building and measuring ray tracers");
     let (tracers, speeds) = measured_tracers(geometry, region, arguments.clock)?;
     let fastest_by = |speed: fn(&TracerSpeed) -> f64| {
@@ -234,7 +242,8 @@ fn compare(arguments: &Arguments, place: &Place) -> Result<SceneReport, String> 
             say(&format!("one segment at {rows} rows"));
             let (segment, clock) = (from_segment::alone(&segments[0]), arguments.clock);
             let limit = arguments.single_limit;
-            single.extend(single_segment::compare(geometry, &segment, rows, &tracers, clock, limit));
+            single
+                .extend(single_segment::compare(geometry, &segment, rows, &tracers, clock, limit));
         }
     }
     let Region { low, high, y } = region;
@@ -257,9 +266,7 @@ fn measured_tracers<'a>(
     region: Region,
     clock: Clock,
 ) -> Result<(Vec<Box<dyn Tracer + 'a>>, Vec<TracerSpeed>), String> {
-    let began = Instant::now();
-    let tracers = tracers::all(geometry, region.center())?;
-    let build = began.elapsed().as_secs_f64();
+    let built = tracers::all(geometry, region.center())?;
     let of = |viewpoints: Viewpoints| {
         let batches = Batches::new(viewpoints);
         let mut rays = Vec::new();
@@ -272,9 +279,9 @@ fn measured_tracers<'a>(
     let frames: Vec<Vec<LocalRay>> = of(Viewpoints::Along(region.perimeter(1e9))).collect();
     let scattered: Vec<Vec<LocalRay>> = of(Viewpoints::Inside(region, 1)).collect();
     let random = random_rays(region);
-    let speeds = tracers
+    let speeds = built
         .iter()
-        .map(|tracer| {
+        .map(|(tracer, build)| {
             let rate = |pieces: &[Vec<LocalRay>]| {
                 let trace = || {
                     pieces.par_iter().for_each_init(Vec::new, |hits, rays| {
@@ -288,11 +295,11 @@ fn measured_tracers<'a>(
                 frames: rate(&frames),
                 scattered: rate(&scattered),
                 random: rate(&random),
-                build,
+                build: *build,
             }
         })
         .collect();
-    Ok((tracers, speeds))
+    Ok((built.into_iter().map(|b| b.0).collect(), speeds))
 }
 
 /// Random directions from random points, in no order.
@@ -320,7 +327,9 @@ mod tests {
         let place: Place = "linz=a,b.glb,-30,50,-10,70,13.7,10".parse().unwrap();
         assert_eq!((place.name.as_str(), place.path), ("linz", PathBuf::from("a,b.glb")));
         assert_eq!((place.region.low, place.region.y, place.length), ([-30.0, 50.0], 13.7, 10.0));
-        for wrong in ["linz", "a=b.glb", "a=b.glb,1,2,3,4,5,x", "a/b=c,0,0,1,1,0,1", "a=c,0,0,1,1,0,0"] {
+        for wrong in
+            ["linz", "a=b.glb", "a=b.glb,1,2,3,4,5,x", "a/b=c,0,0,1,1,0,1", "a=c,0,0,1,1,0,0"]
+        {
             assert!(wrong.parse::<Place>().is_err(), "{wrong}");
         }
     }

@@ -49,6 +49,10 @@ use crate::directions::rotation;
 /// Distance of the plane that hulls are clipped at, metres.
 pub const NEAR: f64 = 1e-4;
 
+/// Intervals of t up to this length are rounding: events of `f64` are exact to some 1e-13 of a
+/// segment. Without it, what lies behind a seam of two triangles would count as seen through it.
+const SLIVER: f64 = 1e-12;
+
 /// Rows of a band.
 const BAND: usize = 8;
 
@@ -78,7 +82,7 @@ impl Interval {
 struct List(Vec<Interval>);
 
 fn push(list: &mut Vec<Interval>, interval: Interval) {
-    if interval.t0 < interval.t1 {
+    if interval.t1 - interval.t0 > SLIVER {
         match list.last_mut() {
             Some(last) if last.primitive == interval.primitive && last.t1 == interval.t0 => {
                 last.t1 = interval.t1;
@@ -141,13 +145,14 @@ impl List {
 
 /// A face of the cube map: forward, right and up.
 fn faces(turn: DMat3) -> [DMat3; 6] {
-    [DVec3::X, -DVec3::X, DVec3::Y, -DVec3::Y, DVec3::Z, -DVec3::Z].map(|forward| {
-        let right = if forward.y == 0.0 { DVec3::Y.cross(forward) } else { DVec3::X };
-        let up = forward.cross(right);
-        // World to face: rows are right, up and forward.
-        turn * DMat3::from_cols(right, up, forward)
-    })
-    .map(|m| m.transpose())
+    [DVec3::X, -DVec3::X, DVec3::Y, -DVec3::Y, DVec3::Z, -DVec3::Z]
+        .map(|forward| {
+            let right = if forward.y == 0.0 { DVec3::Y.cross(forward) } else { DVec3::X };
+            let up = forward.cross(right);
+            // World to face: rows are right, up and forward.
+            turn * DMat3::from_cols(right, up, forward)
+        })
+        .map(|m| m.transpose())
 }
 
 /// The convex hull of the projections, counter-clockwise (lines 4 to 6); empty for less than a
@@ -161,7 +166,8 @@ fn convex_hull(points: &mut [DVec2], hull: &mut Vec<DVec2>) {
     let mut extend = |points: &mut dyn Iterator<Item = DVec2>| {
         let base = hull.len();
         for p in points {
-            while hull.len() >= base + 2 && !turns_left(hull[hull.len() - 2], hull[hull.len() - 1], p)
+            while hull.len() >= base + 2
+                && !turns_left(hull[hull.len() - 2], hull[hull.len() - 1], p)
             {
                 hull.pop();
             }
@@ -222,8 +228,7 @@ impl View {
     /// The rows and columns of the box of projections.
     fn extent(&self, points: &[DVec2]) -> Option<[(usize, usize); 2]> {
         let far = DVec2::splat(f64::INFINITY);
-        let (low, high) =
-            points.iter().fold((far, -far), |(l, h), p| (l.min(*p), h.max(*p)));
+        let (low, high) = points.iter().fold((far, -far), |(l, h), p| (l.min(*p), h.max(*p)));
         // Rounding moves a projection by far less than this share of a pixel.
         let slack = 1e-9 * self.pixels as f64;
         let columns = self.pixels_in(low.x - slack, high.x + slack)?;
@@ -308,7 +313,7 @@ impl Events {
             return None;
         }
         let (depth, slope) = (self.plane[0] / towards, -self.plane[1] / towards);
-        (t0 < t1).then_some(Interval { t0, t1, depth, slope, primitive })
+        (t1 - t0 > SLIVER).then_some(Interval { t0, t1, depth, slope, primitive })
     }
 }
 
@@ -354,7 +359,9 @@ pub fn solve(
         let seen = bands
             .par_iter()
             .enumerate()
-            .map(|(band, primitives)| solve_band(geometry, &view, band * BAND, primitives, &is_late))
+            .map(|(band, primitives)| {
+                solve_band(geometry, &view, band * BAND, primitives, &is_late)
+            })
             .collect::<Option<Vec<_>>>()?;
         sets.extend(seen);
     }
@@ -567,8 +574,7 @@ mod tests {
             for k in 0..100 {
                 let t = (f64::from(k) + random.next_unit()) / 100.0;
                 let covers = |i: &&Interval| i.t0 <= t && t < i.t1;
-                let nearest =
-                    all.iter().filter(covers).min_by(|a, b| a.at(t).total_cmp(&b.at(t)));
+                let nearest = all.iter().filter(covers).min_by(|a, b| a.at(t).total_cmp(&b.at(t)));
                 let found = list.0.iter().find(covers);
                 assert_eq!(nearest.map(|i| i.primitive), found.map(|i| i.primitive));
             }

@@ -295,7 +295,8 @@ impl<'a> Guided<'a> {
     fn look_behind(&self, sample: &Sample, probe: &Probe, reverse: &mut Vec<(DVec3, DVec3)>) {
         let Sample { origin, point, .. } = *sample;
         let far = (probe.target - origin).length();
-        if probe.hit.primitive == MISS || f64::from(probe.hit.distance) > (1.0 - DISCONTINUITY) * far
+        if probe.hit.primitive == MISS
+            || f64::from(probe.hit.distance) > (1.0 - DISCONTINUITY) * far
         {
             return;
         }

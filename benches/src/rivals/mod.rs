@@ -9,9 +9,7 @@ pub mod tests {
     //! Scenes that the tests of several modules share.
 
     use glam::{DAffine3, DQuat, DVec3};
-    use sightline_geometry::{
-        Instance, InstancedGeometry, Mesh, MeshId, ObjectId, PrimitiveId,
-    };
+    use sightline_geometry::{Instance, InstancedGeometry, Mesh, MeshId, ObjectId, PrimitiveId};
 
     use crate::directions::{sphere, stream};
 

@@ -6,8 +6,8 @@
 use std::sync::Arc;
 
 use embree3::{
-    BufferUsage, BuildQuality, Device, Format, Geometry, GeometryKind, Hit16, IntersectContext, Ray,
-    Ray16, RayHit, RayHit16, Scene, ValidMask, ValidMaskN,
+    BufferUsage, BuildQuality, Device, Format, Geometry, GeometryKind, Hit16, IntersectContext,
+    Ray, Ray16, RayHit, RayHit16, Scene, ValidMask, ValidMaskN,
 };
 use glam::DVec3;
 use sightline_geometry::{InstancedGeometry, Mesh};
@@ -92,7 +92,8 @@ impl EmbreeScene {
             let mut builder = device.create_geometry(GeometryKind::INSTANCE).map_err(text)?;
             builder.set_instanced_scene(&meshes[instance.mesh.index()]);
             let m = instance.world_from_mesh;
-            let columns = [m.matrix3.x_axis, m.matrix3.y_axis, m.matrix3.z_axis, m.translation - origin];
+            let columns =
+                [m.matrix3.x_axis, m.matrix3.y_axis, m.matrix3.z_axis, m.translation - origin];
             let mut matrix = [0f32; 16];
             for (k, column) in columns.iter().enumerate() {
                 matrix[4 * k..4 * k + 3].copy_from_slice(&column.as_vec3().to_array());
@@ -136,8 +137,7 @@ impl Embree {
     }
 
     fn one(&self, ray: &LocalRay) -> LocalHit {
-        let ray =
-            Ray::segment(ray.origin.to_array(), ray.direction.to_array(), 0.0, f32::INFINITY);
+        let ray = Ray::segment(ray.origin.to_array(), ray.direction.to_array(), 0.0, f32::INFINITY);
         let mut hit = RayHit::from(ray);
         self.scene.scene.intersect(&mut IntersectContext::incoherent(), &mut hit);
         let triangle = if hit.hit.is_valid() { hit.hit.primID } else { MISS };
@@ -156,8 +156,11 @@ impl Embree {
         }));
         self.scene.scene.intersect16(&mut IntersectContext::coherent(), &mut packet, &valid);
         hits.extend((0..rays.len()).map(|k| {
-            let triangle =
-                if packet.hit.geomID[k] == embree3::INVALID_ID { MISS } else { packet.hit.primID[k] };
+            let triangle = if packet.hit.geomID[k] == embree3::INVALID_ID {
+                MISS
+            } else {
+                packet.hit.primID[k]
+            };
             self.scene.hit(packet.hit.instID[0][k], triangle, packet.ray.tfar[k])
         }));
     }

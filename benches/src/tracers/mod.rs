@@ -12,6 +12,8 @@
 //! threads. Every primitive is an occluder. Scenes of up to [`FLAT_MAX`] triangles are one body, which
 //! spares the way into instances; larger ones keep their instances.
 
+use std::time::Instant;
+
 use glam::{DVec3, Vec3};
 use sightline_geometry::InstancedGeometry;
 
@@ -60,31 +62,31 @@ pub trait Tracer: Send + Sync {
 
     /// A ray in the tracer's space.
     fn local(&self, origin: DVec3, direction: DVec3) -> LocalRay {
-        LocalRay {
-            origin: (origin - self.origin()).as_vec3(),
-            direction: direction.as_vec3(),
-        }
+        let origin = (origin - self.origin()).as_vec3();
+        LocalRay { origin, direction: direction.as_vec3() }
     }
 }
+
+/// A tracer, and the seconds that it took to build on the wall.
+pub type Built<'a> = (Box<dyn Tracer + 'a>, f64);
 
 /// Every tracer of this build, for rays that start near `origin`.
 ///
 /// # Errors
 /// When Embree cannot be started.
-pub fn all<'a>(
-    geometry: &'a InstancedGeometry,
-    origin: DVec3,
-) -> Result<Vec<Box<dyn Tracer + 'a>>, String> {
-    #[allow(unused_mut)]
-    let mut out: Vec<Box<dyn Tracer + 'a>> = vec![
-        Box::new(caster::Caster::new(geometry, origin)),
-        Box::new(wide::Wide::new(geometry, origin)),
-    ];
+pub fn all(geometry: &InstancedGeometry, origin: DVec3) -> Result<Vec<Built<'_>>, String> {
+    let mut out: Vec<Built> = Vec::new();
+    let began = Instant::now();
+    out.push((Box::new(wide::Wide::new(geometry, origin)), began.elapsed().as_secs_f64()));
+    // The scene was read with the hierarchies that the caster walks.
+    out.push((Box::new(caster::Caster::new(geometry, origin)), 0.0));
     #[cfg(feature = "embree")]
     {
+        let began = Instant::now();
         let scene = std::sync::Arc::new(embree::EmbreeScene::new(geometry, origin)?);
-        out.push(Box::new(embree::Embree::single(scene.clone())));
-        out.push(Box::new(embree::Embree::packets(scene)));
+        let seconds = began.elapsed().as_secs_f64();
+        out.push((Box::new(embree::Embree::single(scene.clone())), seconds));
+        out.push((Box::new(embree::Embree::packets(scene)), seconds));
     }
     Ok(out)
 }
@@ -99,7 +101,9 @@ mod tests {
     fn tracers_agree() {
         let origin = DVec3::new(0.05, 0.0, -0.1);
         for geometry in [random_triangles(500, 1), instanced_triangles(40, 30)] {
-            let tracers = all(&geometry, origin).unwrap();
+            let mut tracers: Vec<_> =
+                all(&geometry, origin).unwrap().into_iter().map(|t| t.0).collect();
+            tracers.insert(0, Box::new(caster::Caster::new(&geometry, origin)));
             let mut random = stream(5, 0);
             let directions: Vec<DVec3> =
                 (0..20_000).map(|_| sphere(random.next_unit(), random.next_unit())).collect();

@@ -97,7 +97,8 @@ impl Wide {
             .map(|i| {
                 let b = geometry.meshes[i.mesh.index()].bounds.transformed(&i.world_from_mesh);
                 // Rounding to f32 moves a corner by less than this.
-                let slack = f64::from(f32::EPSILON) * ((b.min - origin).abs() + (b.max - origin).abs());
+                let slack =
+                    f64::from(f32::EPSILON) * ((b.min - origin).abs() + (b.max - origin).abs());
                 let corner = |p: DVec3| (p - origin).as_vec3a();
                 Aabb::new(corner(b.min - slack), corner(b.max + slack))
             })
