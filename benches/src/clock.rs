@@ -41,12 +41,37 @@ impl Stopwatch {
     /// Seconds so far, on the clock that is compared.
     #[must_use]
     pub fn seconds(&self) -> f64 {
-        match self.clock {
-            Clock::Wall => self.wall.as_secs_f64(),
-            Clock::Processor => {
-                self.processor.as_secs_f64() / rayon::current_num_threads().max(1) as f64
-            }
-        }
+        seconds(self.clock, self.wall, self.processor)
+    }
+}
+
+/// A moment on a clock by which work must have ended.
+#[derive(Clone, Copy, Debug)]
+pub struct Deadline {
+    clock: Clock,
+    seconds: f64,
+    began: (Instant, ProcessTime),
+}
+
+impl Deadline {
+    /// `seconds` from now.
+    #[must_use]
+    pub fn after(clock: Clock, seconds: f64) -> Self {
+        Self { clock, seconds, began: (Instant::now(), ProcessTime::now()) }
+    }
+
+    /// True when it has passed.
+    #[must_use]
+    pub fn is_past(&self) -> bool {
+        let (wall, processor) = (self.began.0.elapsed(), self.began.1.elapsed());
+        seconds(self.clock, wall, processor) > self.seconds
+    }
+}
+
+fn seconds(clock: Clock, wall: Duration, processor: Duration) -> f64 {
+    match clock {
+        Clock::Wall => wall.as_secs_f64(),
+        Clock::Processor => processor.as_secs_f64() / rayon::current_num_threads().max(1) as f64,
     }
 }
 

@@ -40,6 +40,7 @@ pub trait Progressive {
 }
 
 /// What curves are measured against.
+#[derive(Clone, Copy)]
 pub struct Judge<'a> {
     /// What is really seen.
     pub truth: &'a Truth,

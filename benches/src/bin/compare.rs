@@ -22,7 +22,7 @@ use sightline_benches::region::Region;
 use sightline_benches::report::{SceneReport, TracerSpeed, claims, section};
 use sightline_benches::rivals::from_point::{Batches, FromPoint, Viewpoints};
 use sightline_benches::rivals::{algorithm_one, guided};
-use sightline_benches::tracers::{self, LocalRay, Tracer};
+use sightline_benches::tracers::{self, LocalRay, Tracer, Tracers};
 use sightline_benches::truth::Truth;
 use sightline_benches::{from_segment, single_segment};
 use sightline_geometry::InstancedGeometry;
@@ -100,6 +100,9 @@ struct Arguments {
     /// Time that a method may take on a scene, seconds.
     #[arg(long, default_value_t = 60.0)]
     limit: f64,
+    /// Time that Algorithm 1 may take on a scene instead, seconds.
+    #[arg(long)]
+    algorithm_limit: Option<f64>,
     /// Viewpoints, spread evenly over the rectangle, at which errors are measured.
     #[arg(long, default_value_t = 16)]
     viewpoints: u32,
@@ -233,6 +236,8 @@ fn compare(arguments: &Arguments, place: &Place) -> Result<SceneReport, String> 
         judge.follow("guided visibility sampling", &mut method)
     });
     add(Method::AlgorithmOne, &|| {
+        let limit = arguments.algorithm_limit.unwrap_or(arguments.limit);
+        let judge = Judge { limit, ..judge };
         algorithm_one::curve(&judge, geometry, &segments, &arguments.pixels, arguments.runs)
     });
 
@@ -261,11 +266,11 @@ fn compare(arguments: &Arguments, place: &Place) -> Result<SceneReport, String> 
 }
 
 /// The tracers of this build and their speeds, for rays from the region.
-fn measured_tracers<'a>(
-    geometry: &'a InstancedGeometry,
+fn measured_tracers(
+    geometry: &InstancedGeometry,
     region: Region,
     clock: Clock,
-) -> Result<(Vec<Box<dyn Tracer + 'a>>, Vec<TracerSpeed>), String> {
+) -> Result<(Tracers<'_>, Vec<TracerSpeed>), String> {
     let built = tracers::all(geometry, region.center())?;
     let of = |viewpoints: Viewpoints| {
         let batches = Batches::new(viewpoints);

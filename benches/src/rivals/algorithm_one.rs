@@ -36,15 +36,14 @@
 //!
 //! Parameters: N (pixels a side of a face), the run's number.
 
-use std::time::Instant;
-
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use sightline_geometry::{InstancedGeometry, PrimitiveId, PrimitiveSet, ViewSegment};
 
-use crate::clock::Stopwatch;
+use crate::clock::{Deadline, Stopwatch};
 use crate::curve::{Curve, Judge};
 use crate::directions::rotation;
+use crate::tracers::FLAT_MAX;
 
 /// Distance of the plane that hulls are clipped at, metres.
 pub const NEAR: f64 = 1e-4;
@@ -182,7 +181,6 @@ fn convex_hull(points: &mut [DVec2], hull: &mut Vec<DVec2>) {
 /// A face, its resolution and the segment.
 struct View {
     face_from_world: DMat3,
-    v0: DVec3,
     /// D, in face coordinates.
     step: DVec3,
     pixels: usize,
@@ -190,9 +188,8 @@ struct View {
 
 impl View {
     /// Vertices in face coordinates, from v0.
-    fn corners(&self, geometry: &InstancedGeometry, primitive: u32) -> [DVec3; 3] {
-        let corners = geometry.triangle(PrimitiveId(primitive)).corners;
-        corners.map(|p| self.face_from_world * (p - self.v0))
+    fn corners(&self, triangles: &Triangles, k: u32) -> [DVec3; 3] {
+        triangles.corners(k).map(|p| self.face_from_world * p)
     }
 
     /// The projections whose hull the triangle sweeps, in pixels: centres are at whole numbers.
@@ -317,18 +314,44 @@ impl Events {
     }
 }
 
-/// Numbers of all primitives, nearest first.
-fn front_to_back(geometry: &InstancedGeometry, segment: &ViewSegment) -> Vec<u32> {
-    let middle = segment.v0.lerp(segment.v1, 0.5);
-    let mut keyed: Vec<(f32, u32)> = (0..geometry.primitive_count())
-        .into_par_iter()
-        .map(|p| {
-            let [a, b, c] = geometry.triangle(PrimitiveId(p)).corners;
-            (((a + b + c) / 3.0).distance_squared(middle) as f32, p)
-        })
-        .collect();
-    keyed.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-    keyed.into_iter().map(|k| k.1).collect()
+/// All triangles, nearest first.
+struct Triangles<'a> {
+    geometry: &'a InstancedGeometry,
+    v0: DVec3,
+    /// Their numbers in the scene.
+    primitives: Vec<u32>,
+    /// Corners from v0, where memory allows it; else they are looked up each time.
+    corners: Vec<[DVec3; 3]>,
+}
+
+impl<'a> Triangles<'a> {
+    fn new(geometry: &'a InstancedGeometry, segment: &ViewSegment) -> Self {
+        let middle = segment.v0.lerp(segment.v1, 0.5);
+        let mut keyed: Vec<(f32, u32)> = (0..geometry.primitive_count())
+            .into_par_iter()
+            .map(|p| {
+                let [a, b, c] = geometry.triangle(PrimitiveId(p)).corners;
+                (((a + b + c) / 3.0).distance_squared(middle) as f32, p)
+            })
+            .collect();
+        keyed.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let primitives: Vec<u32> = keyed.into_iter().map(|k| k.1).collect();
+        let mut out = Self { geometry, v0: segment.v0, primitives, corners: Vec::new() };
+        if geometry.primitive_count() <= FLAT_MAX {
+            let count = out.primitives.len() as u32;
+            out.corners = (0..count).into_par_iter().map(|k| out.looked_up(k)).collect();
+        }
+        out
+    }
+
+    fn looked_up(&self, k: u32) -> [DVec3; 3] {
+        let primitive = PrimitiveId(self.primitives[k as usize]);
+        self.geometry.triangle(primitive).corners.map(|p| p - self.v0)
+    }
+
+    fn corners(&self, k: u32) -> [DVec3; 3] {
+        self.corners.get(k as usize).copied().unwrap_or_else(|| self.looked_up(k))
+    }
 }
 
 /// The visible set of a segment with a cube map of `pixels` x `pixels` x 6, turned by rotation
@@ -339,84 +362,83 @@ pub fn solve(
     segment: &ViewSegment,
     pixels: u32,
     run: u32,
-    deadline: Option<Instant>,
+    deadline: Option<Deadline>,
 ) -> Option<PrimitiveSet> {
-    let is_late = || deadline.is_some_and(|d| Instant::now() > d);
+    let is_late = || deadline.is_some_and(|d| d.is_past());
     let turn = if run == 0 { DMat3::IDENTITY } else { rotation(u64::from(run)) };
-    let order = front_to_back(geometry, segment);
+    let triangles = &Triangles::new(geometry, segment);
     let mut sets = Vec::new();
     for face_from_world in faces(turn) {
         let view = View {
             face_from_world,
-            v0: segment.v0,
             step: face_from_world * (segment.v1 - segment.v0),
             pixels: pixels as usize,
         };
-        let bands = bands(geometry, &view, &order, &is_late);
+        let bands = bands(triangles, &view, &is_late);
         if is_late() {
             return None;
         }
         let seen = bands
             .par_iter()
             .enumerate()
-            .map(|(band, primitives)| {
-                solve_band(geometry, &view, band * BAND, primitives, &is_late)
-            })
+            .map(|(band, members)| solve_band(triangles, &view, band * BAND, members, &is_late))
             .collect::<Option<Vec<_>>>()?;
         sets.extend(seen);
     }
     Some(PrimitiveSet::union(&sets))
 }
 
-/// Phase one: the triangles that touch each band, in the order given.
+/// Phase one: the triangles that touch each band, by their place in the order.
 fn bands(
-    geometry: &InstancedGeometry,
+    triangles: &Triangles,
     view: &View,
-    order: &[u32],
     is_late: &(impl Fn() -> bool + Sync),
 ) -> Vec<Vec<u32>> {
     let count = view.pixels.div_ceil(BAND);
-    let pieces: Vec<Vec<(u32, u32)>> = order
-        .par_chunks(1 << 14)
-        .map_init(Vec::new, |points, primitives| {
+    let piece = 1 << 14;
+    let all = triangles.primitives.len() as u32;
+    let pieces: Vec<Vec<(u32, u32)>> = (0..all.div_ceil(piece))
+        .into_par_iter()
+        .map_init(Vec::new, |points, number| {
             let mut touched = Vec::new();
             if is_late() {
                 return touched;
             }
-            for &primitive in primitives {
-                view.project(&view.corners(geometry, primitive), points);
+            for k in number * piece..all.min((number + 1) * piece) {
+                view.project(&view.corners(triangles, k), points);
                 if let Some([_, (low, high)]) = view.extent(points) {
                     let bands = low / BAND..=high / BAND;
-                    touched.extend(bands.map(|band| (band as u32, primitive)));
+                    touched.extend(bands.map(|band| (band as u32, k)));
                 }
             }
             touched
         })
         .collect();
     let mut out = vec![Vec::new(); count];
-    for (band, primitive) in pieces.into_iter().flatten() {
-        out[band as usize].push(primitive);
+    for (band, k) in pieces.into_iter().flatten() {
+        out[band as usize].push(k);
     }
     out
 }
 
 /// Phase two: the lists of the pixels of a band, and what is on them (lines 1 to 14).
 fn solve_band(
-    geometry: &InstancedGeometry,
+    triangles: &Triangles,
     view: &View,
     first_row: usize,
-    primitives: &[u32],
+    members: &[u32],
     is_late: &impl Fn() -> bool,
 ) -> Option<PrimitiveSet> {
     let end_row = view.pixels.min(first_row + BAND);
     let mut lists = vec![List::default(); (end_row - first_row) * view.pixels];
     let (mut points, mut hull, mut scratch) = (Vec::new(), Vec::new(), Vec::new());
     let center = |k: usize| 2.0 * (k as f64 + 0.5) / view.pixels as f64 - 1.0;
-    for (k, &primitive) in primitives.iter().enumerate() {
-        if k % 1024 == 0 && is_late() {
+    for (done, &k) in members.iter().enumerate() {
+        if done % 1024 == 0 && is_late() {
             return None;
         }
-        let corners = view.corners(geometry, primitive);
+        let primitive = triangles.primitives[k as usize];
+        let corners = view.corners(triangles, k);
         view.project(&corners, &mut points);
         let Some([_, (low, high)]) = view.extent(&points) else { continue };
         convex_hull(&mut points, &mut hull);
@@ -451,9 +473,7 @@ pub fn curve(
     let all = |pixels: u32, run: u32, watch: &mut Stopwatch| {
         let mut sets = Vec::new();
         for segment in segments {
-            // The limit is on the judge's clock; that of the wall gets twice as long.
-            let left = 2.0 * (judge.limit - watch.seconds());
-            let deadline = Instant::now() + std::time::Duration::from_secs_f64(left.max(0.0));
+            let deadline = Deadline::after(judge.clock, judge.limit - watch.seconds());
             let k = run * count + segment.id.0;
             sets.push(watch.time(|| solve(geometry, segment, pixels, k, Some(deadline)))?);
         }
@@ -487,6 +507,7 @@ pub fn curve(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::clock::Clock;
     use crate::directions::stream;
     use crate::rivals::tests::{random_triangles, scene_of};
     use sightline_geometry::raycast::{Ray, RayCaster};
@@ -585,6 +606,6 @@ mod tests {
     fn it_gives_up_at_the_deadline() {
         let geometry = random_triangles(100, 1);
         let s = segment(DVec3::ZERO, DVec3::X);
-        assert_eq!(solve(&geometry, &s, 16, 0, Some(Instant::now())), None);
+        assert_eq!(solve(&geometry, &s, 16, 0, Some(Deadline::after(Clock::Wall, 0.0))), None);
     }
 }

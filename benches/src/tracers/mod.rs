@@ -67,6 +67,9 @@ pub trait Tracer: Send + Sync {
     }
 }
 
+/// Tracers of one scene.
+pub type Tracers<'a> = Vec<Box<dyn Tracer + 'a>>;
+
 /// A tracer, and the seconds that it took to build on the wall.
 pub type Built<'a> = (Box<dyn Tracer + 'a>, f64);
 
