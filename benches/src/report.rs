@@ -38,18 +38,25 @@ pub struct SceneReport {
     pub floor: f64,
 }
 
-/// Rivals' points that are below our curve: method, label, time, its error and ours at that time.
+/// Rivals' points that are below our curve: method, label, time, its error and ours at that time
+/// (at our first time, for points before it).
 #[must_use]
 pub fn points_below(curves: &[Curve], floor: f64) -> Vec<(String, String, f64, f64, f64)> {
     let Some((ours, rivals)) = curves.split_first() else { return Vec::new() };
     let mut below = Vec::new();
     for rival in rivals {
         for p in &rival.points {
-            // Behind our last point, our curve goes on at its level.
+            // Behind our last point, our curve goes on at its level; who is there before our first
+            // point with less error than it is below as well.
             let front = ours.front();
-            let behind = front.last().filter(|last| p.seconds > last.seconds);
-            let our_error =
-                behind.map(|last| last.error.mean).or_else(|| ours.front_at(p.seconds, floor));
+            let (Some(first), Some(last)) = (front.first(), front.last()) else { continue };
+            let our_error = if p.seconds < first.seconds {
+                Some(first.error.mean)
+            } else if p.seconds > last.seconds {
+                Some(last.error.mean)
+            } else {
+                ours.front_at(p.seconds, floor)
+            };
             if let Some(our_error) = our_error
                 && p.error.mean < our_error
             {
@@ -189,13 +196,13 @@ mod tests {
     }
 
     #[test]
-    fn points_below_are_found_between_and_behind_ours_but_not_before() {
+    fn points_below_are_found_before_between_and_behind_ours() {
         let ours = curve(&[(1.0, 0.1), (100.0, 0.001)]);
-        let rival = curve(&[(0.5, 0.01), (10.0, 0.02), (10.0, 0.005), (200.0, 0.0005)]);
+        let rival = curve(&[(0.4, 0.2), (0.5, 0.01), (10.0, 0.02), (10.0, 0.005), (200.0, 0.0005)]);
         let below = points_below(&[ours, rival], 1e-9);
         let times: Vec<f64> = below.iter().map(|b| b.2).collect();
-        assert_eq!(times, [10.0, 200.0]);
-        assert!((below[0].4 - 0.01).abs() < 1e-9);
+        assert_eq!(times, [0.5, 10.0, 200.0]);
+        assert!((below[1].4 - 0.01).abs() < 1e-9);
     }
 
     #[test]

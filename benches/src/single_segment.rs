@@ -126,7 +126,7 @@ impl Progressive for SameDirections<'_> {
     }
 }
 
-/// Runs a rival for at most `limit` seconds. `count` tells how many triangles it has.
+/// Runs a rival for `limit` seconds, or as long as ours when that is longer. `count` tells how many triangles it has.
 fn race<P: Progressive>(
     rival: &mut P,
     count: impl Fn(&P) -> u64,
@@ -134,6 +134,7 @@ fn race<P: Progressive>(
     (our_time, our_found): (f64, u64),
     limit: f64,
 ) -> Race {
+    let limit = limit.max(our_time);
     let mut watch = Stopwatch::new(clock);
     let mut share_at_equal_time = 0.0;
     let mut time_to_share = [None; 4];
