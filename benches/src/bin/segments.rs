@@ -9,8 +9,8 @@
 use std::{path::PathBuf, time::Instant};
 
 use clap::Parser;
-use glam::DVec3;
-use sightline_geometry::{PrimitiveSet, Sampling, SegmentId, ViewSegment};
+use sightline_benches::region::Region;
+use sightline_geometry::{PrimitiveSet, Sampling};
 use sightline_quality::measure_viewpoint;
 use sightline_scene::{OpenOptions, Scene};
 use sightline_solver::{SolveOptions, Statistics, solve_segment_with};
@@ -60,25 +60,12 @@ struct Arguments {
     columns: Option<u32>,
 }
 
-fn perimeter(region: &[f64], y: f64, length: f64) -> Vec<ViewSegment> {
-    let [x0, z0, x1, z1] = region else { panic!("--region x0,z0,x1,z1") };
-    let corners = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)].map(|(x, z)| DVec3::new(*x, y, *z));
-    let mut out = Vec::new();
-    for k in 0..4 {
-        let (a, b) = (corners[k], corners[(k + 1) % 4]);
-        let pieces = ((b - a).length() / length).ceil().max(1.0) as u32;
-        for i in 0..pieces {
-            let at = |i: u32| a.lerp(b, f64::from(i) / f64::from(pieces));
-            out.push(ViewSegment { id: SegmentId(out.len() as u32), v0: at(i), v1: at(i + 1) });
-        }
-    }
-    out
-}
-
 fn main() {
     let arguments = Arguments::parse();
     let scene = Scene::open(&arguments.scene, &OpenOptions::default()).expect("a readable scene");
-    let segments = perimeter(&arguments.region, arguments.y, arguments.length);
+    let [x0, z0, x1, z1] = arguments.region[..] else { panic!("--region x0,z0,x1,z1") };
+    let region = Region::new([x0, z0, x1, z1], arguments.y).expect("a rectangle");
+    let segments = region.perimeter(arguments.length);
     let rows = arguments.rows;
     let sampling = Sampling::with_columns(rows, arguments.columns.unwrap_or(rows));
     let (mut seconds, mut missing) = (0.0, 0.0);
@@ -121,15 +108,8 @@ fn main() {
     println!("in all: {total:?}");
     if arguments.inside > 0 {
         let (mut sum, mut worst) = (0.0, 0.0f64);
-        for k in 0..arguments.inside {
-            let f = |s: f64| (0.5 + f64::from(k) * s).fract();
-            let [x0, z0, x1, z1] = arguments.region[..] else { panic!() };
-            let at = DVec3::new(
-                x0 + f(0.7548776662466927) * (x1 - x0),
-                arguments.y,
-                z0 + f(0.5698402909980532) * (z1 - z0),
-            );
-            let e = measure_viewpoint(&scene.geometry, &all, at, arguments.rays, u64::from(k));
+        for (k, at) in (0..).zip(region.viewpoints(arguments.inside)) {
+            let e = measure_viewpoint(&scene.geometry, &all, at, arguments.rays, k);
             sum += e.error;
             worst = worst.max(e.error);
         }
