@@ -94,7 +94,7 @@ pub fn draw(
             .background_style(WHITE.mix(0.85))
             .border_style(RGBColor(200, 200, 200))
             .position(match axis {
-                Axis::Error => SeriesLabelPosition::LowerLeft,
+                Axis::Error => SeriesLabelPosition::UpperRight,
                 Axis::Found => SeriesLabelPosition::LowerRight,
             })
             .draw()?;

@@ -147,7 +147,11 @@ fn run(arguments: &Arguments) -> Result<(), String> {
         let report = compare(arguments, place)?;
         for (axis, name) in [(Axis::Error, "error"), (Axis::Found, "found")] {
             let path = folder.join(format!("{}-{name}.svg", place.name));
-            plot::draw(&path, &place.name, &report.curves, axis, report.floor)?;
+            let title = match axis {
+                Axis::Error => format!("{}: error against time", place.name),
+                Axis::Found => format!("{}: triangles against time", place.name),
+            };
+            plot::draw(&path, &title, &report.curves, axis, report.floor)?;
         }
         reports.push(report);
         // After every scene, so that a long run can be looked at.
