@@ -91,8 +91,9 @@ struct Arguments {
     /// Rows a face that our method is run with, ascending.
     #[arg(long, value_delimiter = ',', default_value = "16,32,64,128,256,512")]
     rows: Vec<u32>,
-    /// Runs of our method and of Algorithm 1 at their last resolution.
-    #[arg(long, default_value_t = 8)]
+    /// Most runs of our method and of Algorithm 1 at their last resolution; time may end them
+    /// earlier.
+    #[arg(long, default_value_t = 64)]
     runs: u32,
     /// N of the cube maps that Algorithm 1 is run with, ascending.
     #[arg(long, value_delimiter = ',', default_value = "16,32,64,128,256")]
@@ -212,8 +213,11 @@ fn compare(arguments: &Arguments, place: &Place) -> Result<SceneReport, String> 
     let (for_frames, for_scattered) = (fastest_by(|s| s.frames), fastest_by(|s| s.scattered));
 
     say("from-segment");
+    // Our curve reaches as far as any rival's, so that all of their points have one of ours beside.
+    let algorithm_limit = arguments.algorithm_limit.unwrap_or(arguments.limit);
+    let longest = Judge { limit: algorithm_limit.max(arguments.limit), ..judge };
     let mut curves =
-        vec![from_segment::curve(&judge, geometry, &segments, &arguments.rows, arguments.runs)];
+        vec![from_segment::curve(&longest, geometry, &segments, &arguments.rows, arguments.runs)];
     let mut add = |method: Method, make: &dyn Fn() -> Curve| {
         if arguments.runs_method(method) {
             let curve = make();
@@ -240,8 +244,7 @@ fn compare(arguments: &Arguments, place: &Place) -> Result<SceneReport, String> 
         judge.follow("guided visibility sampling", &mut method)
     });
     add(Method::AlgorithmOne, &|| {
-        let limit = arguments.algorithm_limit.unwrap_or(arguments.limit);
-        let judge = Judge { limit, ..judge };
+        let judge = Judge { limit: algorithm_limit, ..judge };
         algorithm_one::curve(&judge, geometry, &segments, &arguments.pixels, arguments.runs)
     });
 
