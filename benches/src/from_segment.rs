@@ -1,62 +1,64 @@
 //! Our method, through its public interface: the perimeter's segments, solved and added up.
 
 use sightline_geometry::{InstancedGeometry, PrimitiveSet, Sampling, SegmentId, ViewSegment};
-use sightline_solver::solve_segment;
+use sightline_solver::{SolveOptions, solve_segment_with};
 
 use crate::clock::Stopwatch;
 use crate::curve::{Curve, Judge};
 
-/// Solves every segment once at `rows` rows; run `run` has its rays elsewhere than other runs.
+/// Passes of finer rays within a solve: the last has 32 times the rows of the first.
+const PASSES: u32 = 5;
+
+/// Share of (directions x segment) that may be missing in a tile in the first round.
+const FIRST_THRESHOLD: f64 = 1e-4;
+
+/// Solves every segment once more, and adds what it sees to what is `known`. Round `round` has its
+/// rays elsewhere than other rounds, and looks four times as closely as the one before.
 #[must_use]
 pub fn perimeter(
     geometry: &InstancedGeometry,
     segments: &[ViewSegment],
     rows: u32,
-    run: u32,
+    round: u32,
+    known: &PrimitiveSet,
 ) -> PrimitiveSet {
-    let sets: Vec<PrimitiveSet> = segments
-        .iter()
-        .map(|segment| {
-            let k = run * segments.len() as u32 + segment.id.0;
-            solve_segment(geometry, segment, Sampling::new(rows).jittered(k)).set
-        })
-        .collect();
-    PrimitiveSet::union(&sets)
+    let threshold = FIRST_THRESHOLD / f64::from(4u32.saturating_pow(round));
+    segments.iter().fold(known.clone(), |known, segment| {
+        let run = round * segments.len() as u32 + segment.id.0;
+        let options = SolveOptions {
+            passes: PASSES,
+            threshold,
+            known: Some(&known),
+            ..SolveOptions::default()
+        };
+        let sampling = Sampling::new(rows).jittered(run);
+        let seen = solve_segment_with(geometry, segment, sampling, &options).set;
+        PrimitiveSet::union([&known, &seen])
+    })
 }
 
-/// A point for each number of rows, then for 2, 4, ... runs of the last, while there is time.
+/// Points after rounds, while there is time.
 #[must_use]
 pub fn curve(
     judge: &Judge,
     geometry: &InstancedGeometry,
     segments: &[ViewSegment],
-    rows: &[u32],
-    runs: u32,
+    rows: u32,
+    rounds: u32,
 ) -> Curve {
     let mut curve = Curve { method: "from-segment (ours)".into(), ..Curve::default() };
+    let mut set = PrimitiveSet::default();
     // Code and scene come into the caches: what the other methods had from their tracers' tests.
-    let _ = perimeter(geometry, &segments[..1], 16, 0);
-    let mut last = None;
-    for &rows in rows {
-        let mut watch = Stopwatch::new(judge.clock);
-        let set = watch.time(|| perimeter(geometry, segments, rows, 0));
-        curve.points.push(judge.point(format!("{rows} rows"), watch.seconds(), &set));
-        // Twice the rows take two to four times as long.
-        let is_last = 3.0 * watch.seconds() > judge.limit;
-        last = Some((rows, watch, set));
-        if is_last {
-            break;
-        }
-    }
-    let Some((rows, mut watch, mut set)) = last else { return curve };
-    for run in 1..runs {
-        let found = watch.time(|| perimeter(geometry, segments, rows, run));
-        set = watch.time(|| PrimitiveSet::union([&set, &found]));
-        let done = run + 1;
-        let is_over = watch.seconds() > judge.limit;
-        if done.is_power_of_two() || done == runs || is_over {
-            let label = format!("{rows} rows, {done} runs");
-            curve.points.push(judge.point(label, watch.seconds(), &set));
+    let _ = perimeter(geometry, &segments[..1], 16, 0, &set);
+    let mut watch = Stopwatch::new(judge.clock);
+    for round in 0..rounds {
+        set = watch.time(|| perimeter(geometry, segments, rows, round, &set));
+        let seconds = watch.seconds();
+        let is_over = seconds > judge.limit || round + 1 == rounds;
+        // A third more time makes a point worth reading.
+        if is_over || curve.points.last().is_none_or(|p| seconds > 4.0 / 3.0 * p.seconds) {
+            let label = format!("{rows} rows, round {}", round + 1);
+            curve.points.push(judge.point(label, seconds, &set));
         }
         if is_over {
             break;

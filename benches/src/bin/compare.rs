@@ -88,11 +88,11 @@ struct Arguments {
     /// Folder for compare.md and the plots; it is made when absent.
     #[arg(long, default_value = "out/compare")]
     out: PathBuf,
-    /// Rows a face that our method is run with, ascending.
-    #[arg(long, value_delimiter = ',', default_value = "16,32,64,128,256,512")]
-    rows: Vec<u32>,
-    /// Most runs of our method and of Algorithm 1 at their last resolution; time may end them
-    /// earlier.
+    /// Rows a face of the first pass of our method.
+    #[arg(long, default_value_t = 24)]
+    rows: u32,
+    /// Most rounds of our method, and runs of Algorithm 1 at its last resolution; time may end
+    /// them earlier.
     #[arg(long, default_value_t = 64)]
     runs: u32,
     /// N of the cube maps that Algorithm 1 is run with, ascending.
@@ -217,7 +217,7 @@ fn compare(arguments: &Arguments, place: &Place) -> Result<SceneReport, String> 
     let algorithm_limit = arguments.algorithm_limit.unwrap_or(arguments.limit);
     let longest = Judge { limit: algorithm_limit.max(arguments.limit), ..judge };
     let mut curves =
-        vec![from_segment::curve(&longest, geometry, &segments, &arguments.rows, arguments.runs)];
+        vec![from_segment::curve(&longest, geometry, &segments, arguments.rows, arguments.runs)];
     let mut add = |method: Method, make: &dyn Fn() -> Curve| {
         if arguments.runs_method(method) {
             let curve = make();

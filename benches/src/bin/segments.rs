@@ -31,7 +31,7 @@ struct Arguments {
     /// Viewpoints, spread evenly over a segment, at which the error of its set is measured.
     #[arg(long, default_value_t = 0)]
     viewpoints: u32,
-    /// Passes of options.
+    /// Passes of refinement.
     #[arg(long, default_value_t = 0)]
     passes: u32,
     /// A tile is refined when this share of (directions x segment) may be missing in it.
