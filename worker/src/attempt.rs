@@ -83,8 +83,9 @@ impl Bake {
             }
             TaskKind::Cells { .. } => {
                 let cells = plan.cells_of(task);
-                let solved = solve::solve_cells(scene, cells, rows, &plan.config, cancel)
-                    .ok_or(AttemptError::GivenUp)?;
+                let solved =
+                    solve::solve_cells(scene, cells, &plan.segments, rows, &plan.config, cancel)
+                        .ok_or(AttemptError::GivenUp)?;
                 let (cells, objects): (Vec<_>, Vec<_>) =
                     solved.into_iter().map(|CellOutput { cell, objects }| (cell, objects)).unzip();
                 Ok(vec![

@@ -18,19 +18,17 @@
 //! Everything is seeded by the cell's number and the round, so the row is a function of scene and
 //! configuration alone.
 
-use std::collections::BTreeMap;
-
 use glam::DVec3;
 use sightline_geometry::{
-    CellId, ObjectId, PrimitiveSet, Sampling, SegmentId, ViewCell, ViewSegment,
-    overlap::primitives_in_cell,
+    PrimitiveSet, Sampling, SegmentId, ViewCell, ViewSegment, overlap::primitives_in_cell,
 };
 use sightline_jobs::{BakeConfig, PlannedCell};
 use sightline_quality::{CellError, measure_viewpoints, random_viewpoints};
 use sightline_scene::Scene;
-use sightline_store::{CellRow, ObjectRow, SegmentRow};
+use sightline_store::{CellEffort, CellRow, SegmentRow};
 
 use crate::solve::{CellOutput, solve_segment};
+use crate::weights::{CellWeights, Seen, object_rows};
 
 /// Lines that are solved at most for one list of suspects: a cell of furniture has a handful of
 /// pockets, and a cell of leaves would never end.
@@ -57,7 +55,7 @@ struct Sight<'a> {
     cell: &'a ViewCell,
     set: PrimitiveSet,
     /// What was solved beyond the planned segments.
-    lines: Vec<SegmentRow>,
+    lines: Vec<(ViewSegment, SegmentRow)>,
     /// Rays cast from held-out viewpoints and scouts.
     rays: u64,
 }
@@ -95,13 +93,13 @@ impl Sight<'_> {
                 let line = line_through(self.cell, viewpoint, along_u);
                 let seen = solve_segment(self.scene, &line, sampling);
                 self.set = PrimitiveSet::union([&self.set, &seen.set]);
-                self.lines.push(seen);
+                self.lines.push((line, seen));
             }
         }
     }
 }
 
-/// The rows of a finished cell. `rows` are the sets of `planned.segments`, in that order.
+/// The rows of a finished cell. `solved` are its planned segments and what they see.
 ///
 /// Runs on the current rayon pool.
 #[must_use]
@@ -109,11 +107,11 @@ pub fn finish_cell(
     scene: &Scene,
     config: &BakeConfig,
     planned: &PlannedCell,
-    rows: &[&SegmentRow],
+    solved: &[(&ViewSegment, &SegmentRow)],
 ) -> CellOutput {
     let (cell, accuracy) = (&planned.cell, &config.accuracy);
     let inside = primitives_in_cell(&scene.geometry, cell);
-    let set = PrimitiveSet::union(rows.iter().map(|r| &r.set).chain([&inside]));
+    let set = PrimitiveSet::union(solved.iter().map(|(_, row)| &row.set).chain([&inside]));
     let mut sight = Sight { scene, config, cell, set, lines: Vec::new(), rays: 0 };
     if accuracy.rounds > 0 && !inside.is_empty() {
         let suspects = sight.scout();
@@ -134,20 +132,35 @@ pub fn finish_cell(
         let tolerated = if mean_is_good { accuracy.worst_error } else { accuracy.target_error };
         sight.look_from(&worst_first(&error), tolerated);
     };
-    let solved: Vec<&SegmentRow> = rows.iter().copied().chain(&sight.lines).collect();
-    CellOutput {
-        objects: object_rows(scene, cell.id, &solved, &sight.set),
-        cell: CellRow {
-            cell: cell.clone(),
-            tile: planned.tile,
-            segments: solved.len() as u32,
-            refinements: rounds,
-            heldout_rays: sight.rays,
-            heldout_error_mean: error.mean(),
-            heldout_error_max: error.max(),
-            set: sight.set,
-        },
-    }
+    let Sight { set, lines, rays, .. } = sight;
+    let seen: Vec<Seen<'_>> = solved
+        .iter()
+        .copied()
+        .chain(lines.iter().map(|(line, row)| (line, row)))
+        .map(|(segment, row)| Seen { row, length: (segment.v1 - segment.v0).length() })
+        .collect();
+    let weights = CellWeights::new(&set, &seen);
+    let sampling = Sampling::new(config.solver.rows);
+    let rays_a_segment = 4 * u64::from(sampling.rows()) * u64::from(sampling.columns());
+    let effort = CellEffort {
+        segments: seen.len() as u32,
+        runs: 1,
+        lines: lines.len() as u32,
+        rows: sampling.rows(),
+        solver_rays: rays_a_segment * seen.len() as u64,
+        refinements: rounds,
+        heldout_viewpoints: error.viewpoints.len() as u32,
+        heldout_rays: rays,
+        heldout_error_mean: error.mean(),
+        heldout_error_upper: error.mean_upper_bound(),
+        heldout_error_max: error.max(),
+        target_met: error.mean_upper_bound() <= accuracy.target_error
+            && error.max() <= accuracy.worst_error,
+    };
+    let objects = object_rows(scene, cell.id, &set, &weights);
+    let weights = weights.codes();
+    let cell = CellRow { cell: cell.clone(), tile: planned.tile, set, weights, effort };
+    CellOutput { objects, cell }
 }
 
 /// The viewpoints with an error, the worst first.
@@ -173,84 +186,10 @@ fn line_through(cell: &ViewCell, point: DVec3, along_u: bool) -> ViewSegment {
     ViewSegment { id: SegmentId(u32::MAX), v0, v1 }
 }
 
-/// One row an object with a member in `set`.
-///
-/// The weight of an object is the mean over the cell's segments of the summed weights of its
-/// primitives; what only reaches into the cell has none.
-fn object_rows(
-    scene: &Scene,
-    cell: CellId,
-    rows: &[&SegmentRow],
-    set: &PrimitiveSet,
-) -> Vec<ObjectRow> {
-    let weights = object_weights(scene, rows);
-    let segments = rows.len().max(1) as f64;
-    visible_objects(scene, set)
-        .map(|(object, visible_primitives)| {
-            let primitives = &scene.objects[object.index()].primitives;
-            let weight = weights.get(&object).copied().unwrap_or(0.0) / segments;
-            ObjectRow {
-                cell,
-                object,
-                visible_primitives,
-                total_primitives: primitives.end - primitives.start,
-                // Each weight is rounded to f32, so a sum may pass the whole by as much.
-                weight: weight.min(1.0),
-                first_state: 0,
-                last_state: 0,
-            }
-        })
-        .collect()
-}
-
-/// Objects with a member in `set`, ascending, and how many members each has.
-fn visible_objects<'a>(
-    scene: &'a Scene,
-    set: &'a PrimitiveSet,
-) -> impl Iterator<Item = (ObjectId, u32)> + 'a {
-    let mut next = 0;
-    std::iter::from_fn(move || {
-        // The object of the first member at or behind `next`.
-        let runs = set.runs();
-        let run = runs.get(runs.partition_point(|run| run.end <= next))?;
-        let object = object_of(scene, run.first.max(next));
-        let range = scene.objects[object.index()].primitives.clone();
-        next = range.end;
-        let count =
-            u32::try_from(set.count_in(range)).expect("an object has under 2^32 primitives");
-        Some((object, count))
-    })
-}
-
-fn object_of(scene: &Scene, primitive: u32) -> ObjectId {
-    let behind = scene.objects.partition_point(|object| object.primitives.end <= primitive);
-    scene.objects[behind].id
-}
-
-/// For each object, the sum of its primitives' weights over the cell's segments. Summed in the
-/// order of segments and primitives, so the sum is always the same.
-fn object_weights(scene: &Scene, rows: &[&SegmentRow]) -> BTreeMap<ObjectId, f64> {
-    let mut sums = BTreeMap::new();
-    for row in rows {
-        let mut current: Option<(std::ops::Range<u32>, ObjectId)> = None;
-        for (primitive, weight) in row.set.iter().zip(&row.weights) {
-            let object = match &current {
-                Some((range, object)) if range.contains(&primitive.0) => *object,
-                _ => {
-                    let object = object_of(scene, primitive.0);
-                    let range = scene.objects[object.index()].primitives.clone();
-                    current = Some((range, object));
-                    object
-                }
-            };
-            *sums.entry(object).or_insert(0.0) += f64::from(*weight);
-        }
-    }
-    sums
-}
-
 #[cfg(test)]
 mod tests {
+    use sightline_geometry::CellId;
+
     use super::*;
 
     #[test]

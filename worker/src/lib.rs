@@ -14,6 +14,7 @@ mod connection;
 mod error;
 mod pool;
 pub mod solve;
+mod weights;
 mod worker;
 
 pub use error::WorkerError;

@@ -48,8 +48,8 @@ pub struct CellOutput {
     pub objects: Vec<ObjectRow>,
 }
 
-/// Finishes cells, in order. `None` when it was cancelled. `rows` holds at least the rows of the
-/// cells' segments.
+/// Finishes cells, in order. `None` when it was cancelled. `segments` are those of the plan, by
+/// number; `rows` holds at least the rows of the cells' segments.
 ///
 /// # Panics
 /// When a row is missing: the caller reads them all.
@@ -57,6 +57,7 @@ pub struct CellOutput {
 pub fn solve_cells(
     scene: &Scene,
     cells: &[PlannedCell],
+    segments: &[ViewSegment],
     rows: &BTreeMap<SegmentId, SegmentRow>,
     config: &BakeConfig,
     cancel: &Cancel,
@@ -64,8 +65,9 @@ pub fn solve_cells(
     cells
         .par_iter()
         .map(|planned| {
-            let rows: Vec<&SegmentRow> = planned.segments.iter().map(|id| &rows[id]).collect();
-            (!cancel.is_cancelled()).then(|| finish_cell(scene, config, planned, &rows))
+            let solved: Vec<(&ViewSegment, &SegmentRow)> =
+                planned.segments.iter().map(|id| (&segments[id.index()], &rows[id])).collect();
+            (!cancel.is_cancelled()).then(|| finish_cell(scene, config, planned, &solved))
         })
         .collect()
 }

@@ -15,7 +15,9 @@ use sightline_proto::v1::{self, lease_response::Answer, report_request};
 use sightline_scene::generate::{Kind, generate};
 use sightline_scene::region::{Heights, RegionSpec, tile};
 use sightline_scene::{OpenOptions, Scene};
-use sightline_store::{BakeStore, CellRow, ObjectRow, decode_cell_part, decode_object_part, keys};
+use sightline_store::{
+    BakeStore, CellRow, ObjectRow, Weight, decode_cell_part, decode_object_part, keys,
+};
 use sightline_worker::{Worker, WorkerError, WorkerOptions, WorkerSummary};
 use tonic::{Request, Response, Status};
 
@@ -216,6 +218,10 @@ async fn rows_do_not_depend_on_threads_or_on_the_cutting_into_tasks() {
         assert_eq!(visible, cell.set.len(), "every visible primitive belongs to an object");
         assert!(own.iter().all(|o| o.visible_primitives <= o.total_primitives));
         assert!(own.iter().any(|o| o.weight > 0.0) && own.iter().all(|o| o.weight <= 1.0));
+        // The city has nothing see-through: no two primitives are the nearest at one ray.
+        let whole: f64 = cell.weights.iter().filter_map(|w| w.share()).sum();
+        assert!(whole > 0.0 && whole <= 1.0 + Weight::RELATIVE_ERROR, "{whole}");
+        assert_eq!(cell.weights.len() as u64, cell.set.len());
     }
 }
 

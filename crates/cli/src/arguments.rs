@@ -44,7 +44,7 @@ pub enum Task {
     Export(Export),
     /// Describe a scene, a dataset or a cell.
     Info(Info),
-    /// Find the cell of a position.
+    /// Find the cell of a position, and what matters most in it.
     Cell(Cell),
     /// Generate a city, bake it, verify it, and show where to look next.
     Demo(Demo),
@@ -245,6 +245,9 @@ pub struct Export {
     /// The cell.
     #[arg(long, value_name = "ID", value_parser = parse_cell)]
     pub cell: CellId,
+    /// Write only the so many most important triangles.
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub budget: Option<u64>,
     /// The file to write.
     #[arg(short, long, value_name = "CELL.glb")]
     pub out: PathBuf,
@@ -276,7 +279,15 @@ pub struct Cell {
     pub dataset: String,
     /// The position, world space, metres.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
-    pub at: glam::DVec3,
+    #[arg(required_unless_present = "cell", conflicts_with = "cell")]
+    pub at: Option<glam::DVec3>,
+    /// The cell, when its number is known.
+    #[arg(long, value_name = "ID", value_parser = parse_cell)]
+    pub cell: Option<CellId>,
+    /// List the so many most important triangles of the cell, each with its share of the view, the
+    /// most important first.
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub budget: Option<u64>,
     /// Print one JSON object.
     #[arg(long)]
     pub json: bool,

@@ -27,7 +27,7 @@ use crate::BakeConfig;
 
 /// Version of the plan and of everything workers write. A bake of another version is another
 /// bake: the version is part of the bake id.
-pub const FORMAT_VERSION: u32 = 1;
+pub const FORMAT_VERSION: u32 = 2;
 
 /// Number of a task in a plan.
 #[derive(

@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use glam::DVec3;
 use sightline_geometry::{CellId, PrimitiveSet, Run, ViewCell};
-use sightline_store::{CellRow, Result, decode_set, encode_cell_part, encode_set};
+use sightline_store::{CellEffort, CellRow, Result, decode_set, encode_cell_part, encode_set};
 
 const CELLS: u32 = 512;
 const OBJECTS: u32 = 20_000;
@@ -53,11 +53,8 @@ fn main() -> Result<()> {
         cell: ViewCell { id: CellId(id), corners: [DVec3::ZERO; 4], height: 0.0 },
         tile: [id as i32, 0],
         set: street_cell(id),
-        segments: 8,
-        refinements: 0,
-        heldout_rays: 0,
-        heldout_error_mean: 0.0,
-        heldout_error_max: 0.0,
+        weights: Vec::new(),
+        effort: CellEffort::default(),
     };
     let rows: Vec<CellRow> = (0..CELLS).map(row).collect();
     let ids: u64 = rows.iter().map(|r| r.set.len()).sum();

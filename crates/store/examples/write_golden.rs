@@ -18,11 +18,11 @@ async fn main() -> Result<()> {
     let open = |name: &str| BakeStore::open_or_create(&folder.join(name).to_string_lossy());
     let sample = Sample::golden();
 
-    let dataset = open("dataset-v1")?;
+    let dataset = open("dataset-v2")?;
     let manifest = sample.write(&dataset, Limits::default()).await;
     publish(&dataset, &manifest).await?;
 
-    let parts = open("parts-v1")?;
+    let parts = open("parts-v2")?;
     let (cells, pairs): (Vec<_>, Vec<_>) = sample.cells.into_iter().unzip();
     parts.put_pointer("segments.parquet", encode_segment_part(&segments(16))?).await?;
     parts.put_pointer("cells.parquet", encode_cell_part(&cells)?).await?;

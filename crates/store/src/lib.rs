@@ -4,7 +4,7 @@
 //! - [`parts`]: what tasks write while a bake runs.
 //! - [`DatasetWriter`] and [`publish`]: from rows to a published dataset.
 //! - [`Dataset`]: reading it, cell by cell or whole, and [`Dataset::check`].
-//! - [`codec`]: a set of primitives as bytes.
+//! - [`codec`]: a set of primitives as bytes; [`Weight`]: how important one is, in a byte.
 //!
 //! Formats are contracts: versioned prose in `schemas/`, golden files in `schemas/golden/`.
 //!
@@ -25,6 +25,7 @@ mod reader;
 mod rows;
 mod tables;
 mod verify;
+mod weight;
 mod writer;
 
 pub use access::{BakeStore, Created};
@@ -42,8 +43,9 @@ pub use parts::{
 pub use publish::{Published, current, publish};
 pub use reader::Dataset;
 pub use rows::{
-    CellEntry, CellRow, GltfTriangle, NumberedInstance, NumberedMesh, Numbering, ObjectRow,
-    ObjectsLocation, SceneObject, SegmentRow, SetLocation,
+    CellEffort, CellEntry, CellRow, GltfTriangle, NumberedInstance, NumberedMesh, Numbering,
+    ObjectRow, ObjectsLocation, SceneObject, SegmentRow, SetLocation,
 };
 pub use verify::{CheckReport, Problem};
+pub use weight::Weight;
 pub use writer::{DatasetWriter, Description, Limits};

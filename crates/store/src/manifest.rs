@@ -2,7 +2,7 @@
 //!
 //! A manifest is a function of scene and configuration (ST-1): it holds no clock reading, host or
 //! absolute path, and not even its own number, so a second bake of the same input publishes
-//! nothing new. Format: `schemas/dataset-v1.md`.
+//! nothing new. Format: `schemas/dataset-v2.md`.
 
 use std::collections::BTreeMap;
 
@@ -16,8 +16,8 @@ use crate::{Result, StoreError, keys};
 
 /// Name of the dataset format.
 pub const FORMAT: &str = "sightline-dataset";
-/// Version of the dataset format that this crate reads and writes.
-pub const VERSION: u32 = 1;
+/// Version of the dataset format that this crate writes. Those before it are read, too.
+pub const VERSION: u32 = 2;
 /// Name of the pointer's format; it shares the dataset's version.
 const POINTER_FORMAT: &str = "sightline-pointer";
 
@@ -26,7 +26,7 @@ const POINTER_FORMAT: &str = "sightline-pointer";
 pub struct Manifest {
     /// Always [`FORMAT`].
     pub format: String,
-    /// Always [`VERSION`].
+    /// [`VERSION`], or an earlier one in a dataset that was written then.
     pub version: u32,
     /// The scene that was baked.
     pub scene: SceneSource,
@@ -165,7 +165,7 @@ pub struct DataFile {
 pub struct Pointer {
     /// Always `sightline-pointer`.
     pub format: String,
-    /// Always [`VERSION`].
+    /// [`VERSION`], or an earlier one in a dataset that was written then.
     pub version: u32,
     /// Number of the manifest.
     pub manifest: u64,
@@ -225,7 +225,7 @@ fn parse<T: DeserializeOwned>(file: &str, bytes: &[u8], format: &str) -> Result<
         return Err(StoreError::corrupt(file, format!("its format is not `{format}`")));
     }
     match value["version"].as_u64() {
-        Some(found) if found == u64::from(VERSION) => {}
+        Some(found) if (1..=u64::from(VERSION)).contains(&found) => {}
         Some(found) => {
             let (file, supported) = (file.into(), VERSION);
             return Err(StoreError::UnsupportedVersion { file, found, supported });

@@ -4,6 +4,8 @@ use sightline_geometry::{
     Bounds, CellId, MeshId, ObjectId, PrimitiveId, PrimitiveSet, SegmentId, ViewCell,
 };
 
+use crate::Weight;
+
 /// What one view segment sees.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SegmentRow {
@@ -25,16 +27,82 @@ pub struct CellRow {
     pub tile: [i32; 2],
     /// The visible primitives.
     pub set: PrimitiveSet,
-    /// Segments that were solved for the cell.
+    /// One weight a member, in ascending order of the members: the mean over the cell's segments,
+    /// by length, of the share of (solid angle x segment) on which the member is nearest.
+    pub weights: Vec<Weight>,
+    /// What was solved, and what was measured.
+    pub effort: CellEffort,
+}
+
+/// What a cell took, in counts that are the same on every machine, and the error that was left.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CellEffort {
+    /// Segments that were solved for the cell, those of the plan included.
     pub segments: u32,
+    /// Of these, runs along the whole perimeter; the plan's are one.
+    pub runs: u32,
+    /// Of these, lines through viewpoints where a pocket was found.
+    pub lines: u32,
+    /// Rows of a face of the finest run.
+    pub rows: u32,
+    /// Rays of the grid over all segments: 4 faces x rows x columns each. A shared segment counts
+    /// for each of its cells.
+    pub solver_rays: u64,
     /// Refinement rounds that were run.
     pub refinements: u32,
-    /// Rays cast from held-out viewpoints to measure the error.
+    /// Viewpoints of the last measurement, which the errors are from.
+    pub heldout_viewpoints: u32,
+    /// All rays that were cast from held-out viewpoints, in all rounds.
     pub heldout_rays: u64,
-    /// Mean pixel error over the held-out viewpoints, share of pixels.
+    /// Mean pixel error over the viewpoints of the cell, as measured, share of pixels.
     pub heldout_error_mean: f64,
-    /// Pixel error of the worst held-out viewpoint, share of pixels.
+    /// Upper end of the one-sided 95 % confidence interval of that mean.
+    pub heldout_error_upper: f64,
+    /// Pixel error of the worst viewpoint that was measured in full, share of pixels.
     pub heldout_error_max: f64,
+    /// True when the error aimed at was met.
+    pub target_met: bool,
+}
+
+impl Default for CellEffort {
+    /// Nothing solved, nothing known.
+    fn default() -> Self {
+        Self {
+            segments: 0,
+            runs: 0,
+            lines: 0,
+            rows: 0,
+            solver_rays: 0,
+            refinements: 0,
+            heldout_viewpoints: 0,
+            heldout_rays: 0,
+            heldout_error_mean: 0.0,
+            heldout_error_upper: 1.0,
+            heldout_error_max: 0.0,
+            target_met: false,
+        }
+    }
+}
+
+impl CellRow {
+    /// The members with their weights, the most important first; among equal weights the lower
+    /// primitive number. Members without a measured weight come last.
+    #[must_use]
+    pub fn by_importance(&self) -> Vec<(PrimitiveId, Weight)> {
+        let mut members: Vec<_> = self.set.iter().zip(self.weights.iter().copied()).collect();
+        // A stable sort keeps ascending numbers.
+        members.sort_by_key(|(_, weight)| std::cmp::Reverse(*weight));
+        members
+    }
+
+    /// The `budget` most important members as a set; all of them when there are no more.
+    #[must_use]
+    pub fn most_important(&self, budget: usize) -> PrimitiveSet {
+        let mut kept: Vec<u32> =
+            self.by_importance().into_iter().take(budget).map(|(p, _)| p.0).collect();
+        kept.sort_unstable();
+        PrimitiveSet::from_sorted(kept)
+    }
 }
 
 /// How much of one object a cell sees.
@@ -202,6 +270,11 @@ pub struct SetLocation {
     pub page_bytes: u32,
     /// Place of the set among the values of that page.
     pub page_row: u32,
+    /// Offset in the file of the data page that holds the weights, bytes; 0 in datasets of
+    /// version 1, which have none.
+    pub weights_offset: u32,
+    /// Size of that page with its header, bytes.
+    pub weights_bytes: u32,
 }
 
 /// Where a cell's (cell, object) rows lie.

@@ -33,10 +33,10 @@ use sightline_geometry::{
 };
 
 use crate::rows::{
-    CellEntry, CellRow, NumberedInstance, NumberedMesh, ObjectRow, ObjectsLocation, SceneObject,
-    SegmentRow, SetLocation,
+    CellEffort, CellEntry, CellRow, NumberedInstance, NumberedMesh, ObjectRow, ObjectsLocation,
+    SceneObject, SegmentRow, SetLocation,
 };
-use crate::{Result, StoreError, decode_set, encode_set};
+use crate::{Result, StoreError, Weight, decode_set, encode_set};
 
 /// Metadata key of a file's format.
 const FORMAT_KEY: &str = "sightline.format";
@@ -82,8 +82,10 @@ pub(crate) type Column = (&'static str, Kind, &'static str);
 pub(crate) struct Table {
     /// Name of the format, in the files' metadata.
     pub format: &'static str,
-    /// Version of the format.
+    /// Version of the format that is written.
     pub version: u32,
+    /// Columns that version 1 did not have, in a table of version 2 whose version 1 is still read.
+    pub added: &'static [&'static str],
     /// Rows in a row group.
     pub row_group_rows: usize,
     /// The columns, in the order of the file.
@@ -109,17 +111,38 @@ const CELL_COLUMNS: &[Column] = &[
     ("height", Kind::F64, "from the lower to the upper eye height, metres"),
     ("primitives", Kind::U32, "number of visible primitives"),
     ("segments", Kind::U32, "view segments solved for the cell"),
+    ("runs", Kind::U32, "of these, runs along the perimeter"),
+    ("lines", Kind::U32, "of these, lines through viewpoints"),
+    ("rows", Kind::U32, "rows of a face of the finest run"),
+    ("solver_rays", Kind::U64, "rays of the grid over all segments"),
     ("refinements", Kind::U32, "refinement rounds"),
-    ("heldout_rays", Kind::U64, "rays cast from held-out viewpoints"),
+    ("heldout_viewpoints", Kind::U32, "viewpoints of the last measurement"),
+    ("heldout_rays", Kind::U64, "rays cast from held-out viewpoints, in all rounds"),
     ("heldout_error_mean", Kind::F64, "mean pixel error of held-out viewpoints, share of pixels"),
+    ("heldout_error_upper", Kind::F64, "95 % upper bound of the mean error, share of pixels"),
     ("heldout_error_max", Kind::F64, "worst pixel error of a held-out viewpoint, share of pixels"),
+    ("target_met", Kind::Bool, "true when the error aimed at was met"),
     ("set", Kind::Blob, "visible primitives: varint (gap, length) runs, set encoding version 1"),
+    ("weights", Kind::Blob, "one byte a visible primitive, ascending: weight encoding version 1"),
+];
+
+/// Columns of [`CELL_COLUMNS`] that version 1 did not have.
+const CELL_COLUMNS_OF_2: &[&str] = &[
+    "runs",
+    "lines",
+    "rows",
+    "solver_rays",
+    "heldout_viewpoints",
+    "heldout_error_upper",
+    "target_met",
+    "weights",
 ];
 
 /// What segments tasks write.
 pub(crate) const SEGMENT_PART: Table = Table {
     format: "sightline-part-segments",
     version: 1,
+    added: &[],
     row_group_rows: 64,
     columns: &[
         ("segment", Kind::U32, "number of the view segment in the plan"),
@@ -141,7 +164,8 @@ pub(crate) const SEGMENT_PART: Table = Table {
 /// What cells tasks write: cells.
 pub(crate) const CELL_PART: Table = Table {
     format: "sightline-part-cells",
-    version: 1,
+    version: 2,
+    added: &[],
     row_group_rows: 1024,
     columns: CELL_COLUMNS,
 };
@@ -150,6 +174,7 @@ pub(crate) const CELL_PART: Table = Table {
 pub(crate) const OBJECT_PART: Table = Table {
     format: "sightline-part-objects",
     version: 1,
+    added: &[],
     row_group_rows: 1 << 17,
     columns: &[
         ("cell", Kind::U32, "number of the view cell"),
@@ -164,13 +189,19 @@ pub(crate) const OBJECT_PART: Table = Table {
 
 /// `data/cells-*`: one row a cell. 1,024 rows a row group keep a footer entry per 1,024 cells and
 /// let an engine read groups in parallel; the sets are in pages of their own whatever the group.
-pub(crate) const CELLS: Table =
-    Table { format: "sightline-cells", version: 1, row_group_rows: 1024, columns: CELL_COLUMNS };
+pub(crate) const CELLS: Table = Table {
+    format: "sightline-cells",
+    version: 2,
+    added: CELL_COLUMNS_OF_2,
+    row_group_rows: 1024,
+    columns: CELL_COLUMNS,
+};
 
 /// `data/objects-*`: one row a (cell, object). Row groups of the usual size for engines.
 pub(crate) const OBJECTS: Table = Table {
     format: "sightline-objects",
     version: 1,
+    added: &[],
     row_group_rows: 1 << 17,
     columns: &[
         ("cell", Kind::U32, "number of the view cell"),
@@ -187,7 +218,8 @@ pub(crate) const OBJECTS: Table = Table {
 /// `data/index-*`: one row a cell, small, fetched first.
 pub(crate) const INDEX: Table = Table {
     format: "sightline-index",
-    version: 1,
+    version: 2,
+    added: &["weights_offset", "weights_bytes"],
     row_group_rows: 1 << 16,
     columns: &[
         ("cell", Kind::U32, "number of the view cell, in Hilbert order"),
@@ -219,6 +251,8 @@ pub(crate) const INDEX: Table = Table {
         ("page_offset", Kind::U32, "offset of the data page with the cell's set, bytes"),
         ("page_bytes", Kind::U32, "size of that page with its header, bytes"),
         ("page_row", Kind::U32, "place of the set among the values of that page"),
+        ("weights_offset", Kind::U32, "offset of the data page with the cell's weights, bytes"),
+        ("weights_bytes", Kind::U32, "size of that page with its header, bytes"),
         ("objects_file", Kind::Text, "key of the file with the cell's (cell, object) rows"),
         ("objects_first_row", Kind::U32, "first of those rows in the file"),
         ("objects_rows", Kind::U32, "number of those rows"),
@@ -229,6 +263,7 @@ pub(crate) const INDEX: Table = Table {
 pub(crate) const SCENE: Table = Table {
     format: "sightline-scene",
     version: 1,
+    added: &[],
     row_group_rows: 1 << 16,
     columns: &[
         ("object", Kind::U32, "number of the object"),
@@ -251,6 +286,7 @@ pub(crate) const SCENE: Table = Table {
 pub(crate) const INSTANCES: Table = Table {
     format: "sightline-numbering",
     version: 1,
+    added: &[],
     row_group_rows: 1 << 16,
     columns: &[
         ("first_primitive", Kind::U32, "global number of the instance's first triangle"),
@@ -265,6 +301,7 @@ pub(crate) const INSTANCES: Table = Table {
 pub(crate) const MESHES: Table = Table {
     format: "sightline-meshes",
     version: 1,
+    added: &[],
     row_group_rows: 64,
     columns: &[
         ("mesh", Kind::U32, "number of the mesh"),
@@ -373,15 +410,24 @@ impl Table {
             let problem = format!("it is not a {} file", self.format);
             return Err(StoreError::corrupt(file, problem));
         }
+        let oldest = if self.added.is_empty() { self.version } else { 1 };
         match value(VERSION_KEY).parse::<u64>() {
-            Ok(version) if version == u64::from(self.version) => {}
+            Ok(version) if (u64::from(oldest)..=u64::from(self.version)).contains(&version) => {
+                self.expect_columns(file, metadata, version < u64::from(self.version))
+            }
             Ok(found) => {
                 let supported = self.version;
-                return Err(StoreError::UnsupportedVersion { file: file.into(), found, supported });
+                Err(StoreError::UnsupportedVersion { file: file.into(), found, supported })
             }
-            Err(_) => return Err(StoreError::corrupt(file, "it names no version")),
+            Err(_) => Err(StoreError::corrupt(file, "it names no version")),
         }
+    }
+
+    fn expect_columns(&self, file: &str, metadata: &ArrowReaderMetadata, old: bool) -> Result<()> {
         for field in self.schema().fields() {
+            if old && self.added.contains(&field.name().as_str()) {
+                continue;
+            }
             let found = metadata.schema().field_with_name(field.name());
             let found = found.map_err(|_| {
                 StoreError::corrupt(file, format!("column `{}` is missing", field.name()))
@@ -480,6 +526,20 @@ fn sets<'a>(values: impl Iterator<Item = &'a PrimitiveSet>) -> ArrayRef {
     Arc::new(builder.finish())
 }
 
+fn weights<'a>(values: impl Iterator<Item = &'a [Weight]>) -> ArrayRef {
+    let mut builder = BinaryBuilder::new();
+    for weights in values {
+        builder.append_value(weights.iter().map(|w| w.code()).collect::<Vec<u8>>());
+    }
+    Arc::new(builder.finish())
+}
+
+fn flags(values: impl Iterator<Item = bool>) -> ArrayRef {
+    let mut builder = BooleanBuilder::new();
+    values.for_each(|v| builder.append_value(v));
+    Arc::new(builder.finish())
+}
+
 /// The number of members of a set, as tables store it: primitive numbers have 32 bits.
 pub(crate) fn count(set: &PrimitiveSet) -> u32 {
     u32::try_from(set.len()).expect("a set of 32-bit numbers below the last has a 32-bit size")
@@ -534,12 +594,20 @@ pub(crate) fn cell_batch(table: &Table, rows: &[CellRow]) -> Result<RecordBatch>
     columns.extend(cell_geometry(rows.iter().map(|r| &r.cell)));
     columns.extend([
         numbers::<UInt32Type>(rows.iter().map(|r| count(&r.set))),
-        numbers::<UInt32Type>(rows.iter().map(|r| r.segments)),
-        numbers::<UInt32Type>(rows.iter().map(|r| r.refinements)),
-        numbers::<UInt64Type>(rows.iter().map(|r| r.heldout_rays)),
-        numbers::<Float64Type>(rows.iter().map(|r| r.heldout_error_mean)),
-        numbers::<Float64Type>(rows.iter().map(|r| r.heldout_error_max)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.effort.segments)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.effort.runs)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.effort.lines)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.effort.rows)),
+        numbers::<UInt64Type>(rows.iter().map(|r| r.effort.solver_rays)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.effort.refinements)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.effort.heldout_viewpoints)),
+        numbers::<UInt64Type>(rows.iter().map(|r| r.effort.heldout_rays)),
+        numbers::<Float64Type>(rows.iter().map(|r| r.effort.heldout_error_mean)),
+        numbers::<Float64Type>(rows.iter().map(|r| r.effort.heldout_error_upper)),
+        numbers::<Float64Type>(rows.iter().map(|r| r.effort.heldout_error_max)),
+        flags(rows.iter().map(|r| r.effort.target_met)),
         sets(rows.iter().map(|r| &r.set)),
+        weights(rows.iter().map(|r| &r.weights[..])),
     ]);
     table.batch(columns)
 }
@@ -582,6 +650,8 @@ pub(crate) fn index_batch(rows: &[CellEntry]) -> Result<RecordBatch> {
         numbers::<UInt32Type>(rows.iter().map(|r| r.set.page_offset)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.set.page_bytes)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.set.page_row)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.set.weights_offset)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.set.weights_bytes)),
         texts(rows.iter().map(|r| r.objects.file.as_str())),
         numbers::<UInt32Type>(rows.iter().map(|r| r.objects.first_row)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.objects.rows)),
@@ -590,8 +660,6 @@ pub(crate) fn index_batch(rows: &[CellEntry]) -> Result<RecordBatch> {
 }
 
 pub(crate) fn scene_batch(rows: &[SceneObject]) -> Result<RecordBatch> {
-    let mut occluders = BooleanBuilder::new();
-    rows.iter().for_each(|r| occluders.append_value(r.occluder));
     let mut columns = vec![
         numbers::<UInt32Type>(rows.iter().map(|r| r.id.0)),
         texts(rows.iter().map(|r| r.name.as_str())),
@@ -599,7 +667,7 @@ pub(crate) fn scene_batch(rows: &[SceneObject]) -> Result<RecordBatch> {
         numbers::<UInt32Type>(rows.iter().map(|r| r.node)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.first_primitive)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.end_primitive)),
-        Arc::new(occluders.finish()),
+        flags(rows.iter().map(|r| r.occluder)),
     ];
     columns.extend(boxes(rows.iter().map(|r| r.bounds)));
     SCENE.batch(columns)
@@ -648,6 +716,15 @@ impl<'a> Columns<'a> {
         typed.ok_or_else(|| {
             StoreError::corrupt(self.file, format!("column `{name}` is missing or of another type"))
         })
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.batch.column_by_name(name).is_some()
+    }
+
+    /// A column that version 1 did not have; `expect` has seen to it that later versions do.
+    fn added<T: 'static>(&self, name: &str) -> Result<Option<&'a T>> {
+        self.has(name).then(|| self.get(name)).transpose()
     }
 
     fn numbers<T: ArrowPrimitiveType>(&self, name: &str) -> Result<&'a [T::Native]>
@@ -741,25 +818,55 @@ pub(crate) fn cell_rows(file: &str, batch: &RecordBatch) -> Result<Vec<CellRow>>
     let tile_x = columns.numbers::<Int32Type>("tile_x")?;
     let tile_z = columns.numbers::<Int32Type>("tile_z")?;
     let sizes = columns.u32s("primitives")?;
+    let sets = columns.get::<BinaryArray>("set")?;
+    let weights = columns.added::<BinaryArray>("weights")?;
+    let efforts = cell_efforts(&columns)?;
+    let row = |((row, cell), effort): ((usize, ViewCell), CellEffort)| {
+        let set = columns.set(sets, sizes, row)?;
+        let weights = match weights {
+            Some(weights) => weights.value(row).iter().copied().map(Weight::from_code).collect(),
+            None => vec![Weight::UNMEASURED; sizes[row] as usize],
+        };
+        Ok(CellRow { cell, tile: [tile_x[row], tile_z[row]], set, weights, effort })
+    };
+    columns.cells()?.into_iter().enumerate().zip(efforts).map(row).collect()
+}
+
+fn cell_efforts(columns: &Columns<'_>) -> Result<Vec<CellEffort>> {
     let segments = columns.u32s("segments")?;
     let refinements = columns.u32s("refinements")?;
     let heldout_rays = columns.numbers::<UInt64Type>("heldout_rays")?;
     let error_mean = columns.f64s("heldout_error_mean")?;
     let error_max = columns.f64s("heldout_error_max")?;
-    let sets = columns.get::<BinaryArray>("set")?;
-    let row = |(row, cell): (usize, ViewCell)| {
-        Ok(CellRow {
-            cell,
-            tile: [tile_x[row], tile_z[row]],
-            set: columns.set(sets, sizes, row)?,
-            segments: segments[row],
-            refinements: refinements[row],
-            heldout_rays: heldout_rays[row],
-            heldout_error_mean: error_mean[row],
-            heldout_error_max: error_max[row],
-        })
+    let of_1 = |row: usize| CellEffort {
+        segments: segments[row],
+        refinements: refinements[row],
+        heldout_rays: heldout_rays[row],
+        heldout_error_mean: error_mean[row],
+        heldout_error_max: error_max[row],
+        ..CellEffort::default()
     };
-    columns.cells()?.into_iter().enumerate().map(row).collect()
+    if !columns.has("runs") {
+        return Ok((0..segments.len()).map(of_1).collect());
+    }
+    let runs = columns.u32s("runs")?;
+    let lines = columns.u32s("lines")?;
+    let rows = columns.u32s("rows")?;
+    let solver_rays = columns.numbers::<UInt64Type>("solver_rays")?;
+    let heldout_viewpoints = columns.u32s("heldout_viewpoints")?;
+    let error_upper = columns.f64s("heldout_error_upper")?;
+    let target_met = columns.get::<BooleanArray>("target_met")?;
+    let of_2 = |row: usize| CellEffort {
+        runs: runs[row],
+        lines: lines[row],
+        rows: rows[row],
+        solver_rays: solver_rays[row],
+        heldout_viewpoints: heldout_viewpoints[row],
+        heldout_error_upper: error_upper[row],
+        target_met: target_met.value(row),
+        ..of_1(row)
+    };
+    Ok((0..segments.len()).map(of_2).collect())
 }
 
 pub(crate) fn object_rows(file: &str, batch: &RecordBatch) -> Result<Vec<ObjectRow>> {
@@ -794,6 +901,10 @@ pub(crate) fn index_rows(file: &str, batch: &RecordBatch) -> Result<Vec<CellEntr
     let page_offsets = columns.u32s("page_offset")?;
     let page_bytes = columns.u32s("page_bytes")?;
     let page_rows = columns.u32s("page_row")?;
+    let of_weights =
+        |name: &str| if columns.has(name) { columns.u32s(name).map(Some) } else { Ok(None) };
+    let weights_offsets = of_weights("weights_offset")?;
+    let weights_bytes = of_weights("weights_bytes")?;
     let objects_files = columns.get::<StringArray>("objects_file")?;
     let first_rows = columns.u32s("objects_first_row")?;
     let row_counts = columns.u32s("objects_rows")?;
@@ -808,6 +919,8 @@ pub(crate) fn index_rows(file: &str, batch: &RecordBatch) -> Result<Vec<CellEntr
             page_offset: page_offsets[row],
             page_bytes: page_bytes[row],
             page_row: page_rows[row],
+            weights_offset: weights_offsets.map_or(0, |offsets| offsets[row]),
+            weights_bytes: weights_bytes.map_or(0, |bytes| bytes[row]),
         },
         objects: ObjectsLocation {
             file: objects_files.value(row).to_owned(),

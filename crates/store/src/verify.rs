@@ -12,7 +12,7 @@ use crate::reader::verified;
 use crate::rows::{CellEntry, CellRow, ObjectRow, SceneObject};
 use crate::tables::{CELLS, INDEX, INSTANCES, MESHES, OBJECTS, SCENE, Table, count};
 use crate::tables::{cell_rows, object_rows};
-use crate::writer::{check_cell, check_objects, check_pairs};
+use crate::writer::{check_cell, check_objects, check_pairs, check_weights};
 use crate::{BakeStore, Dataset, Result, StoreError, keys};
 
 /// What is wrong with a file.
@@ -133,6 +133,8 @@ impl Dataset {
         primitives: u64,
         report: &mut CheckReport,
     ) -> Result<()> {
+        // Version 1 had no weights.
+        let weighed = self.manifest().version > 1;
         let mut entries = self.cells().iter();
         let mut pairs = std::pin::pin!(self.all_object_rows());
         let mut next_pair = pairs.try_next().await?;
@@ -147,7 +149,7 @@ impl Dataset {
                 own.push(pair);
                 next_pair = pairs.try_next().await?;
             }
-            check_row(&row, entry, &own, objects, primitives, report);
+            check_row(&row, entry, &own, objects, primitives, weighed, report);
             report.cells += 1;
         }
         if entries.next().is_some() || next_pair.is_some() {
@@ -164,13 +166,20 @@ fn check_row(
     pairs: &[ObjectRow],
     objects: &[SceneObject],
     primitives: u64,
+    weighed: bool,
     report: &mut CheckReport,
 ) {
     if let Err(problem) = check_cell(row, primitives) {
         report.broken(&entry.set.file, problem);
     }
-    if let Err(problem) = check_pairs(row, pairs, objects) {
-        report.broken(&entry.objects.file, problem);
+    match check_pairs(row, pairs, objects) {
+        Err(problem) => report.broken(&entry.objects.file, problem),
+        Ok(()) if !weighed => {}
+        Ok(()) => {
+            if let Err(problem) = check_weights(row, pairs, objects) {
+                report.broken(&entry.set.file, problem);
+            }
+        }
     }
     let agrees = entry.cell == row.cell
         && entry.tile == row.tile
@@ -245,4 +254,77 @@ fn table(kind: FileKind) -> &'static Table {
 
 fn first_file(dataset: &Dataset, kind: FileKind) -> &str {
     dataset.manifest().files_of(kind).next().map_or(keys::POINTER, |file| file.name.as_str())
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+    use sightline_geometry::{Bounds, ObjectId, PrimitiveSet, ViewCell};
+
+    use super::*;
+    use crate::{CellEffort, ObjectsLocation, SetLocation, Weight};
+
+    /// A cell that sees three primitives of one object, of which the rows say `weight`.
+    fn problems_with(weights: &[f64], weight: f64) -> Vec<Problem> {
+        let cell = ViewCell { id: CellId(7), corners: [DVec3::ZERO; 4], height: 0.0 };
+        let row = CellRow {
+            cell: cell.clone(),
+            tile: [0, 0],
+            set: PrimitiveSet::from_sorted([1, 2, 4]),
+            weights: weights.iter().map(|w| Weight::from_share(*w)).collect(),
+            effort: CellEffort::default(),
+        };
+        let set = SetLocation {
+            file: "data/cells-x.parquet".into(),
+            row_group: 0,
+            row: 0,
+            page_offset: 4,
+            page_bytes: 20,
+            page_row: 0,
+            weights_offset: 24,
+            weights_bytes: 20,
+        };
+        let objects_at =
+            ObjectsLocation { file: "data/objects-x.parquet".into(), first_row: 0, rows: 1 };
+        let entry = CellEntry { cell, tile: [0, 0], primitives: 3, set, objects: objects_at };
+        let pair = ObjectRow {
+            cell: CellId(7),
+            object: ObjectId(0),
+            visible_primitives: 3,
+            total_primitives: 5,
+            weight,
+            first_state: 0,
+            last_state: 0,
+        };
+        let object = SceneObject {
+            id: ObjectId(0),
+            name: String::new(),
+            path: String::new(),
+            node: 0,
+            first_primitive: 0,
+            end_primitive: 5,
+            occluder: true,
+            bounds: Bounds::EMPTY,
+        };
+        let mut report = CheckReport::default();
+        check_row(&row, &entry, &[pair], &[object], 5, true, &mut report);
+        report.problems
+    }
+
+    #[test]
+    fn corrupted_weights_are_named_with_file_cell_and_remedy() {
+        assert_eq!(problems_with(&[0.1, 0.2, 0.3], 0.6), []);
+        for (weights, weight, says) in [
+            (&[0.1, 0.2, 0.9][..], 0.6, "object 0 in cell 7 add up to"),
+            (&[0.1, 0.2, 0.0001], 0.6, "object 0 in cell 7 add up to"),
+            (&[0.1, 0.2], 0.6, "cell 7 has 2 weights for 3 primitives"),
+            (&[0.9, 0.9, 0.9], 2.7, "the weights of cell 7 add up to"),
+        ] {
+            let found = problems_with(weights, weight);
+            let problem = found.first().unwrap_or_else(|| panic!("{weights:?} are accepted"));
+            assert_eq!(problem.file, "data/cells-x.parquet");
+            assert!(problem.problem.contains(says), "{}", problem.problem);
+            assert!(problem.problem.contains("bake again"), "{}", problem.problem);
+        }
+    }
 }

@@ -26,13 +26,13 @@ use crate::tables::{
     CELLS, INDEX, INSTANCES, MESHES, OBJECTS, SCENE, TRIANGLES_PER_ROW, Table, beyond, cell_batch,
     count, index_batch, instance_batch, mesh_batch, object_batch, scene_batch,
 };
-use crate::{BakeStore, Result, StoreError};
+use crate::{BakeStore, Result, StoreError, Weight};
 
 /// Hexadecimal digits of a file's hash in its name: 128 bits.
 const HASH_DIGITS: usize = 32;
-/// Upper bound of what a cell's row takes besides its set: 21 plain values of 8 bytes, and its
-/// share of page headers, offset index and footer.
-const CELL_BYTES_MAX: usize = 512;
+/// Upper bound of what a cell's row takes besides its set and weights: 28 plain values of 8 bytes,
+/// and its share of page headers, offset index and footer.
+const CELL_BYTES_MAX: usize = 640;
 /// Upper bound of what a (cell, object) row takes: 7 plain values of 8 bytes or fewer, a
 /// dictionary index, its share of pages and footer. Names are in dictionaries, bounded apart.
 const PAIR_BYTES_MAX: usize = 80;
@@ -160,6 +160,7 @@ impl DatasetWriter {
         }
         check_cell(row, self.primitives).map_err(|problem| CELLS.invalid(problem))?;
         check_pairs(row, pairs, &self.objects).map_err(|problem| OBJECTS.invalid(problem))?;
+        check_weights(row, pairs, &self.objects).map_err(|problem| CELLS.invalid(problem))?;
         let first_row = self.write_pairs(row.cell.id, pairs).await?;
         self.write_cell(row).await?;
         self.totals.primitives += row.set.len();
@@ -176,6 +177,8 @@ impl DatasetWriter {
                 page_offset: 0,
                 page_bytes: 0,
                 page_row: 0,
+                weights_offset: 0,
+                weights_bytes: 0,
             },
             objects: ObjectsLocation { file: String::new(), first_row, rows: pairs.len() as u32 },
         });
@@ -217,9 +220,9 @@ impl DatasetWriter {
 
     async fn write_cell(&mut self, row: &CellRow) -> Result<()> {
         let batch = cell_batch(&CELLS, std::slice::from_ref(row))?;
-        let encoded = encoded_set_bytes(&batch);
-        self.totals.set_bytes += encoded as u64;
-        let more = encoded + CELL_BYTES_MAX;
+        let set_bytes = encoded_bytes(&batch, "set");
+        self.totals.set_bytes += set_bytes as u64;
+        let more = set_bytes + encoded_bytes(&batch, "weights") + CELL_BYTES_MAX;
         if let Some(open) = &self.cells
             && open.size_with(more, CELL_BYTES_MAX / 8) > self.limits.file_bytes_max
         {
@@ -400,25 +403,32 @@ fn footer_start(file: &str, bytes: &Bytes) -> Result<usize> {
     Ok(ends.max().unwrap_or(4))
 }
 
-/// Size of the encoded set in a batch of one cell.
-fn encoded_set_bytes(batch: &RecordBatch) -> usize {
-    let sets = batch.column_by_name("set").map(|column| column.as_binary::<i32>());
-    sets.map_or(0, |sets| sets.value(0).len())
+/// Size of a binary value in a batch of one cell.
+fn encoded_bytes(batch: &RecordBatch, column: &str) -> usize {
+    let values = batch.column_by_name(column).map(|column| column.as_binary::<i32>());
+    values.map_or(0, |values| values.value(0).len())
 }
 
-/// Fills in where the sets of a finished cells file lie, from its own offset index.
+/// Fills in where the sets and weights of a finished cells file lie, from its own offset index.
 fn locate_sets(file: &str, bytes: Bytes, entries: &mut [CellEntry]) -> Result<()> {
     let odd = |problem: &str| StoreError::corrupt(file, problem);
     let metadata = ParquetMetaDataReader::new()
         .with_page_index_policy(PageIndexPolicy::Optional)
         .parse_and_finish(&bytes)
         .map_err(|e| StoreError::corrupt(file, e))?;
-    let set_column = CELLS.columns.len() - 1;
+    let column = |name| CELLS.columns.iter().position(|c| c.0 == name);
+    let columns = column("set").zip(column("weights"));
+    let (set_column, weights_column) = columns.ok_or_else(|| odd("it has no sets"))?;
     let mut entries = entries.iter_mut();
     for (group, group_metadata) in metadata.row_groups().iter().enumerate() {
         let index = metadata.page_index_for_row_group(group);
         let pages =
             index.page_locations(set_column).ok_or_else(|| odd("it has no offset index"))?;
+        let weights =
+            index.page_locations(weights_column).ok_or_else(|| odd("it has no offset index"))?;
+        if pages.len() != weights.len() {
+            return Err(odd("its sets and weights are paged otherwise"));
+        }
         let rows = group_metadata.num_rows() as u32;
         for (k, page) in pages.iter().enumerate() {
             let first = page.first_row_index as u32;
@@ -432,6 +442,8 @@ fn locate_sets(file: &str, bytes: Bytes, entries: &mut [CellEntry]) -> Result<()
                     page_offset: page.offset as u32,
                     page_bytes: page.compressed_page_size as u32,
                     page_row: row - first,
+                    weights_offset: weights[k].offset as u32,
+                    weights_bytes: weights[k].compressed_page_size as u32,
                 };
             }
         }
@@ -470,9 +482,63 @@ pub(crate) fn check_cell(row: &CellRow, primitives: u64) -> Result<(), String> {
             run.end - 1
         ));
     }
+    if row.weights.len() as u64 != row.set.len() {
+        return Err(format!(
+            "cell {id} has {} weights for {} primitives; {REPAIR}",
+            row.weights.len(),
+            row.set.len()
+        ));
+    }
     let finite = row.cell.corners.iter().all(|c| c.is_finite()) && row.cell.height.is_finite();
     if !finite || row.cell.height < 0.0 {
         return Err(format!("cell {id} has no proper shape"));
+    }
+    Ok(())
+}
+
+/// Bound on the relative error of a sum of weights besides that of their codes: each has 24 bits
+/// when it leaves the solver, and sums of up to 2^32 of them in 53 bits lose no more than 21.
+const SUM_ROUNDING: f64 = 1.0 / (1 << 20) as f64;
+
+/// What helps against weights that contradict themselves.
+const REPAIR: &str = "fetch the dataset again from where it was published, or bake again";
+
+/// Checks a cell's weights against the weights of its objects: each object's is the sum of those
+/// of its primitives, up to the rounding of the codes.
+///
+/// The rows have passed [`check_cell`] and [`check_pairs`].
+pub(crate) fn check_weights(
+    row: &CellRow,
+    pairs: &[ObjectRow],
+    objects: &[SceneObject],
+) -> Result<(), String> {
+    let cell = row.cell.id;
+    let mut members = row.set.iter().zip(&row.weights);
+    let mut whole = 0.0;
+    for pair in pairs {
+        let object = &objects[pair.object.index()];
+        let members = members.by_ref().take(pair.visible_primitives as usize);
+        let sum: f64 = members.filter_map(|(_, weight)| weight.share()).sum();
+        // Each share is within a factor of the code's rounding; those that took the lowest code
+        // may be anything below it.
+        let factor = 1.0 + Weight::RELATIVE_ERROR + SUM_ROUNDING;
+        let lowest = Weight::from_code(1).share().unwrap_or(0.0);
+        let slack = lowest * f64::from(pair.visible_primitives);
+        let fits = pair.weight <= sum * factor + slack && sum <= pair.weight * factor + slack;
+        // See-through primitives of one object may cover each other: their sum is cut at 1.
+        if !fits && !(pair.weight >= 1.0 && sum >= 1.0 / factor) {
+            return Err(format!(
+                "the weights of the primitives of object {} in cell {cell} add up to {sum:.3e}, \
+                 and its row says {:.3e}; {REPAIR}",
+                pair.object, pair.weight
+            ));
+        }
+        whole += if object.occluder { sum } else { 0.0 };
+    }
+    if whole > 1.0 + Weight::RELATIVE_ERROR + SUM_ROUNDING {
+        return Err(format!(
+            "the weights of cell {cell} add up to {whole:.3} of the view; {REPAIR}"
+        ));
     }
     Ok(())
 }

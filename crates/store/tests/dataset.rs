@@ -8,10 +8,10 @@ use std::sync::atomic::Ordering;
 use futures::TryStreamExt;
 use glam::DVec3;
 use object_store::memory::InMemory;
-use sightline_geometry::{CellId, PrimitiveId};
+use sightline_geometry::{CellId, PrimitiveId, PrimitiveSet};
 use sightline_store::{
-    BakeStore, Dataset, DatasetWriter, ErrorClass, FileKind, Limits, Published, StoreError, keys,
-    publish,
+    BakeStore, CellRow, Dataset, DatasetWriter, ErrorClass, FileKind, Limits, Published,
+    StoreError, Weight, keys, publish,
 };
 use support::Sample;
 use support::faulty::{Fault, Faulty};
@@ -88,22 +88,31 @@ async fn equal_rows_give_equal_bytes() {
 }
 
 #[tokio::test]
-async fn a_page_in_the_index_holds_the_cells_set() {
+async fn pages_in_the_index_hold_the_cells_set_and_weights() {
     let sample = Sample::golden();
     let store = published(&sample).await;
     let dataset = Dataset::open(&store).await.unwrap();
-    let mut ends = Vec::new();
+    let (mut ends, mut weight_pages) = (Vec::new(), Vec::new());
     for entry in dataset.cells() {
         assert_eq!(entry.set.page_row, 0, "a page holds one set");
         let range = u64::from(entry.set.page_offset)
             ..u64::from(entry.set.page_offset + entry.set.page_bytes);
         let page = store.get_range(&entry.set.file, range.clone()).await.unwrap();
+        let weights = u64::from(entry.set.weights_offset)
+            ..u64::from(entry.set.weights_offset + entry.set.weights_bytes);
+        assert_eq!(
+            store.get_range(&entry.set.file, weights.clone()).await.unwrap()[..2],
+            [0x15, 0]
+        );
+        weight_pages.push(weights);
         // A page header is a thrift struct whose first field, an i32 under number 1, is the page
         // type; 0 stands for DATA_PAGE.
         assert_eq!(page[..2], [0x15, 0x00]);
         ends.push(range);
     }
-    assert!(ends.windows(2).all(|w| w[0].end == w[1].start), "pages follow each other");
+    for pages in [ends, weight_pages] {
+        assert!(pages.windows(2).all(|w| w[0].end == w[1].start), "pages follow each other");
+    }
 }
 
 #[tokio::test]
@@ -276,10 +285,10 @@ async fn later_versions_are_refused_as_such() {
     let store = published(&Sample::golden()).await;
     let pointer = store.get(keys::POINTER).await.unwrap();
     let text = String::from_utf8(pointer.to_vec()).unwrap();
-    let later = text.replace("\"version\":1", "\"version\":2,\"more\":true");
+    let later = text.replace("\"version\":2", "\"version\":3,\"more\":true");
     store.put_pointer(keys::POINTER, later).await.unwrap();
     let error = Dataset::open(&store).await.unwrap_err();
-    assert!(matches!(error, StoreError::UnsupportedVersion { found: 2, .. }), "{error}");
+    assert!(matches!(error, StoreError::UnsupportedVersion { found: 3, .. }), "{error}");
 }
 
 #[tokio::test]
@@ -302,6 +311,42 @@ async fn rows_that_break_the_contract_are_refused() {
     numbering.instances.pop();
     let error = new().finish(&numbering, sample.description.clone()).await.unwrap_err();
     assert_eq!(error.class(), ErrorClass::FixInput);
+}
+
+#[tokio::test]
+async fn a_budget_keeps_the_most_important_and_breaks_ties_by_number() {
+    let mut row = Sample::golden().cells[1].0.clone();
+    row.set = PrimitiveSet::from_sorted([2, 5, 6, 9, 40]);
+    row.weights = [3, 9, 0, 9, 200].map(Weight::from_code).to_vec();
+    let order: Vec<u32> = row.by_importance().iter().map(|(p, _)| p.0).collect();
+    assert_eq!(order, [40, 5, 9, 2, 6], "members without a weight come last");
+    assert_eq!(row.most_important(2), PrimitiveSet::from_sorted([5, 40]));
+    assert_eq!(row.most_important(0), PrimitiveSet::default());
+    assert_eq!(row.most_important(99), row.set);
+}
+
+#[tokio::test]
+async fn weights_that_contradict_their_objects_are_refused_with_cell_and_remedy() {
+    let sample = Sample::golden();
+    let store = BakeStore::in_memory();
+    let (cell, pairs) = &sample.cells[1];
+    let refused = async |cell: CellRow| {
+        let mut writer = DatasetWriter::new(&store, sample.objects.clone()).unwrap();
+        let error = writer.push_cell(&cell, pairs).await.unwrap_err().to_string();
+        assert!(error.contains("cell 1") && error.contains("bake again"), "{error}");
+        error
+    };
+    let mut fewer = cell.clone();
+    fewer.weights.pop();
+    let error = refused(fewer).await;
+    assert!(error.contains("weights for"), "{error}");
+    let mut heavier = cell.clone();
+    heavier.weights[0] = Weight::from_share(0.5);
+    let error = refused(heavier).await;
+    assert!(error.contains(&format!("object {}", pairs[0].object)), "{error}");
+    let mut whole = cell.clone();
+    whole.weights.fill(Weight::from_share(1.0));
+    let _ = refused(whole).await;
 }
 
 #[tokio::test]

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 use futures::TryStreamExt;
 use sightline_store::{
-    BakeStore, Dataset, Limits, decode_cell_part, decode_object_part, decode_segment_part,
+    BakeStore, Dataset, Limits, Weight, decode_cell_part, decode_object_part, decode_segment_part,
     encode_cell_part, encode_object_part, encode_segment_part, publish,
 };
 use support::{Sample, segments};
@@ -21,8 +21,29 @@ fn golden(folder: &str) -> BakeStore {
 }
 
 #[tokio::test]
-async fn golden_dataset_still_reads() {
+async fn datasets_of_version_1_still_read() {
     let store = golden("dataset-v1");
+    let report = Dataset::check(&store).await.unwrap();
+    assert!(report.is_sound(), "{:?}", report.problems);
+    let dataset = Dataset::open(&store).await.unwrap();
+    assert_eq!(dataset.manifest().version, 1);
+    for (row, pairs) in &Sample::golden().cells {
+        let old = dataset.cell(row.cell.id).await.unwrap();
+        assert_eq!((&old.cell, old.tile, &old.set), (&row.cell, row.tile, &row.set));
+        assert!(old.weights.iter().all(|w| *w == Weight::UNMEASURED));
+        assert_eq!(old.weights.len() as u64, old.set.len());
+        assert_eq!(old.effort.heldout_error_mean, row.effort.heldout_error_mean);
+        assert_eq!((old.effort.heldout_error_upper, old.effort.target_met), (1.0, false));
+        // The sample of version 1 had larger objects.
+        let mut pairs = pairs.clone();
+        pairs.iter_mut().for_each(|pair| pair.weight *= 64.0);
+        assert_eq!(dataset.object_rows(row.cell.id).await.unwrap(), pairs);
+    }
+}
+
+#[tokio::test]
+async fn golden_dataset_still_reads() {
+    let store = golden("dataset-v2");
     let report = Dataset::check(&store).await.unwrap();
     assert!(report.is_sound(), "{:?}", report.problems);
     let dataset = Dataset::open(&store).await.unwrap();
@@ -41,7 +62,7 @@ async fn writer_reproduces_golden_bytes() {
     let store = BakeStore::in_memory();
     let manifest = Sample::golden().write(&store, Limits::default()).await;
     publish(&store, &manifest).await.unwrap();
-    let golden = golden("dataset-v1");
+    let golden = golden("dataset-v2");
     let keys = golden.list("").await.unwrap();
     assert_eq!(store.list("").await.unwrap(), keys);
     for key in keys {
@@ -51,7 +72,7 @@ async fn writer_reproduces_golden_bytes() {
 
 #[tokio::test]
 async fn golden_parts_still_read_and_are_reproduced() {
-    let store = golden("parts-v1");
+    let store = golden("parts-v2");
     let (cells, pairs): (Vec<_>, Vec<_>) = Sample::golden().cells.into_iter().unzip();
     let pairs = pairs.concat();
 

@@ -138,6 +138,14 @@ pub struct Summary {
     pub heldout_rays: u64,
     /// Mean held-out pixel error over the cells, share of pixels.
     pub error_mean: f64,
+    /// Largest 95 % upper bound of a cell's mean pixel error, share of pixels.
+    pub error_upper: f64,
+    /// Cells whose target was met.
+    pub targets_met: u64,
+    /// Segments solved over all cells; a shared one counts for each of its cells.
+    pub segments: u64,
+    /// Rays of the solver's grids over all cells; those of shared segments for each cell.
+    pub solver_rays: u64,
     /// Held-out pixel error of the worst viewpoint of all cells, share of pixels.
     pub error_max: f64,
     /// Refinement rounds of all cells.
@@ -155,10 +163,15 @@ impl Summary {
             out.cells += 1;
             visible += members;
             out.visible_max = out.visible_max.max(members);
-            out.heldout_rays += row.heldout_rays;
-            out.refinements += u64::from(row.refinements);
-            error += row.heldout_error_mean;
-            out.error_max = out.error_max.max(row.heldout_error_max);
+            let effort = &row.effort;
+            out.heldout_rays += effort.heldout_rays;
+            out.refinements += u64::from(effort.refinements);
+            out.segments += u64::from(effort.segments);
+            out.solver_rays += effort.solver_rays;
+            out.targets_met += u64::from(effort.target_met);
+            error += effort.heldout_error_mean;
+            out.error_upper = out.error_upper.max(effort.heldout_error_upper);
+            out.error_max = out.error_max.max(effort.heldout_error_max);
         }
         let cells = out.cells.max(1) as f64;
         (out.visible_mean, out.error_mean) = (visible as f64 / cells, error / cells);
@@ -175,8 +188,12 @@ impl Summary {
             "reduction": self.reduction(),
             "heldout_rays": self.heldout_rays,
             "heldout_error_mean": self.error_mean,
+            "heldout_error_upper_max": self.error_upper,
             "heldout_error_max": self.error_max,
             "refinements": self.refinements,
+            "targets_met": self.targets_met,
+            "segments": self.segments,
+            "solver_rays": self.solver_rays,
         })
     }
 
@@ -187,7 +204,7 @@ impl Summary {
 
     /// Adds the figures to a table.
     pub fn add_to(&self, table: &mut crate::report::Table) {
-        use crate::report::{percent, thousands};
+        use crate::report::{count, percent, thousands};
         table.row("cells", thousands(self.cells)).row("triangles", thousands(self.primitives));
         if self.cells == 0 {
             return;
@@ -213,6 +230,16 @@ impl Summary {
                     thousands(self.heldout_rays)
                 ),
             );
+            let (met, all) = (thousands(self.targets_met), count(self.cells, "cell"));
+            table.row("target met", format!("in {met} of {all}"));
         }
+        table.row(
+            "solved",
+            format!(
+                "{} of the cells, {} rays",
+                count(self.segments, "segment"),
+                thousands(self.solver_rays)
+            ),
+        );
     }
 }

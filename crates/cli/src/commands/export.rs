@@ -17,7 +17,10 @@ pub fn run(command: &Export) -> Result<()> {
     let runtime = super::runtime()?;
     let (dataset, scene, path) = runtime.block_on(open_with_scene(&command.input))?;
     super::expect_cell(&dataset, command.cell)?;
-    let row = runtime.block_on(dataset.cell(command.cell))?;
+    let mut row = runtime.block_on(dataset.cell(command.cell))?;
+    if let Some(budget) = command.budget {
+        row.set = row.most_important(usize::try_from(budget).unwrap_or(usize::MAX));
+    }
     let report = write(&path, &scene, &row, &command.out)?;
     if command.json {
         print_json(&json!({

@@ -5,7 +5,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 use sightline_geometry::{Bounds, CellId};
 use sightline_scene::{IngestReport, OpenOptions, Scene};
-use sightline_store::Dataset;
+use sightline_store::{CellRow, Dataset};
 
 use super::dataset::{self, Summary};
 use crate::arguments::Info;
@@ -190,7 +190,12 @@ async fn describe_dataset(dataset: &Dataset, command: &Info) -> Result<()> {
     }
     let totals = &manifest.totals;
     let bits = 8.0 * totals.set_bytes as f64 / totals.primitives.max(1) as f64;
-    table.row("sets", format!("{} ({bits:.2} bits a member)", bytes(totals.set_bytes))).row(
+    let weights: u64 = dataset.cells().iter().map(|e| u64::from(e.set.weights_bytes)).sum();
+    let weight_bits = 8.0 * weights as f64 / totals.primitives.max(1) as f64;
+    table
+        .row("sets", format!("{} ({bits:.2} bits a member)", bytes(totals.set_bytes)))
+        .row("weights", format!("{} ({weight_bits:.2} bits a member)", bytes(weights)));
+    table.row(
         "files",
         format!("{} in {}", bytes(totals.file_bytes), count(manifest.files.len() as u64, "file")),
     );
@@ -199,9 +204,41 @@ async fn describe_dataset(dataset: &Dataset, command: &Info) -> Result<()> {
     Ok(())
 }
 
+/// Shares of what is seen, for which the number of triangles is told.
+const SHARES: [f64; 3] = [0.9, 0.99, 0.999];
+
+/// For each of [`SHARES`], how many of the most important triangles take so much of what the cell
+/// sees. Empty where nothing has a weight.
+fn shares(row: &CellRow) -> Vec<(f64, usize)> {
+    let weights: Vec<f64> = row.by_importance().iter().filter_map(|(_, w)| w.share()).collect();
+    let whole: f64 = weights.iter().sum();
+    let sums: Vec<f64> = weights
+        .iter()
+        .scan(0.0, |sum, weight| {
+            *sum += weight;
+            Some(*sum)
+        })
+        .collect();
+    let needed = |share: f64| sums.partition_point(|sum| *sum < share * whole) + 1;
+    let known = SHARES.iter().filter(|_| !sums.is_empty());
+    known.map(|&share| (share, needed(share).min(sums.len()))).collect()
+}
+
+fn needed(row: &CellRow) -> String {
+    let texts: Vec<String> = shares(row)
+        .iter()
+        .map(|(share, n)| format!("{} for {:.1} %", thousands(*n as u64), 100.0 * share))
+        .collect();
+    if texts.is_empty() {
+        return "unknown: the dataset has no weights".into();
+    }
+    format!("{} of what is seen", texts.join(", "))
+}
+
 async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Result<()> {
     super::expect_cell(dataset, cell)?;
     let row = dataset.cell(cell).await?;
+    let effort = row.effort;
     let objects = dataset.objects().await?;
     let mut pairs = dataset.object_rows(cell).await?;
     pairs.sort_by(|a, b| b.weight.total_cmp(&a.weight).then(a.object.cmp(&b.object)));
@@ -226,11 +263,19 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
             "height": row.cell.height,
             "visible_primitives": row.set.len(),
             "runs": row.set.runs().len(),
-            "segments": row.segments,
-            "refinements": row.refinements,
-            "heldout_rays": row.heldout_rays,
-            "heldout_error_mean": row.heldout_error_mean,
-            "heldout_error_max": row.heldout_error_max,
+            "segments": effort.segments,
+            "runs": effort.runs,
+            "lines": effort.lines,
+            "rows": effort.rows,
+            "solver_rays": effort.solver_rays,
+            "refinements": effort.refinements,
+            "heldout_viewpoints": effort.heldout_viewpoints,
+            "heldout_rays": effort.heldout_rays,
+            "heldout_error_mean": effort.heldout_error_mean,
+            "heldout_error_upper": effort.heldout_error_upper,
+            "heldout_error_max": effort.heldout_error_max,
+            "target_met": effort.target_met,
+            "needed_for": shares(&row),
             "objects": objects,
         }));
         return Ok(());
@@ -249,17 +294,30 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
             ),
         )
         .row("objects", thousands(pairs.len() as u64))
-        .row("segments", thousands(u64::from(row.segments)))
-        .row("refinements", thousands(u64::from(row.refinements)))
+        .row("needed", needed(&row))
+        .row(
+            "solved",
+            format!(
+                "{} in {} and {}, up to {}; {} rays",
+                count(u64::from(effort.segments), "segment"),
+                count(u64::from(effort.runs), "run"),
+                count(u64::from(effort.lines), "line"),
+                count(u64::from(effort.rows), "row"),
+                thousands(effort.solver_rays)
+            ),
+        )
+        .row("refinements", thousands(u64::from(effort.refinements)))
         .row(
             "pixel error",
             format!(
-                "mean {}, worst viewpoint {} ({} held-out rays)",
-                percent(row.heldout_error_mean),
-                percent(row.heldout_error_max),
-                thousands(row.heldout_rays)
+                "mean {}, below {} with 95 % confidence, worst viewpoint {} ({} held-out rays)",
+                percent(effort.heldout_error_mean),
+                percent(effort.heldout_error_upper),
+                percent(effort.heldout_error_max),
+                thousands(effort.heldout_rays)
             ),
-        );
+        )
+        .row("target", if effort.target_met { "met" } else { "not met" });
     let mut list = Table::default();
     for pair in pairs.iter().take(command.limit) {
         list.row(

@@ -38,6 +38,10 @@ pub struct Findings {
     histogram: [u64; CLASSES.len() + 1],
     worst: Option<Worst>,
     seconds: f64,
+    /// What the bake itself measured in these cells: the sum of the mean errors, and the number of
+    /// cells whose target was met.
+    baked_sum: f64,
+    baked_met: u64,
 }
 
 impl Findings {
@@ -63,6 +67,11 @@ impl Findings {
                 self.worst = Some(Worst { cell: cell.cell, error: *error });
             }
         }
+    }
+
+    /// Mean over the cells of the error that the bake measured, share of pixels.
+    fn baked_mean(&self) -> f64 {
+        self.baked_sum / self.cells.max(1) as f64
     }
 
     fn rays_per_second(&self) -> f64 {
@@ -106,6 +115,8 @@ pub fn measure(
         let row = runtime.block_on(dataset.cell(cell))?;
         expect_members(&row, scene)?;
         findings.add(&measure_row(scene, &row.cell, &row.set, command));
+        findings.baked_sum += row.effort.heldout_error_mean;
+        findings.baked_met += u64::from(row.effort.target_met);
     }
     drop(progress);
     findings.seconds = started.elapsed().as_secs_f64();
@@ -210,6 +221,7 @@ fn to_json(findings: &Findings, command: &Verify, exceeded: &[String]) -> Value 
         "worst": worst,
         "limits": { "max_mean": command.max_mean, "max_worst": command.max_worst },
         "exceeded": exceeded,
+        "baked": { "error_mean": findings.baked_mean(), "targets_met": findings.baked_met },
         "seconds": findings.seconds,
         "rays_per_second": findings.rays_per_second(),
     })
@@ -224,6 +236,15 @@ pub fn to_text(findings: &Findings, command: &Verify) -> String {
         .row("rays", thousands(findings.rays))
         .row("mean pixel error", percent(findings.mean()))
         .row("worst pixel error", percent(findings.max()))
+        .row(
+            "said by the bake",
+            format!(
+                "mean {}, target met in {} of {}",
+                percent(findings.baked_mean()),
+                thousands(findings.baked_met),
+                count(findings.cells, "cell")
+            ),
+        )
         .row(
             "time",
             format!(

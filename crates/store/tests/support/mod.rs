@@ -13,8 +13,8 @@ use sightline_geometry::{
     Bounds, CellId, MeshId, ObjectId, PrimitiveSet, Run, SegmentId, ViewCell,
 };
 use sightline_store::{
-    BakeStore, CellRow, DatasetWriter, Description, Limits, Manifest, NumberedInstance,
-    NumberedMesh, Numbering, ObjectRow, SceneFile, SceneObject, SceneSource, SegmentRow,
+    BakeStore, CellEffort, CellRow, DatasetWriter, Description, Limits, Manifest, NumberedInstance,
+    NumberedMesh, Numbering, ObjectRow, SceneFile, SceneObject, SceneSource, SegmentRow, Weight,
 };
 
 /// Numbers that look random and are the same on every machine (Knuth's MMIX constants).
@@ -133,7 +133,8 @@ fn cell(id: u32, objects: &[SceneObject], random: &mut Sequence) -> (CellRow, Ve
             object: object.id,
             visible_primitives: end - first,
             total_primitives: total,
-            weight: f64::from(random.below(1 << 20)) / f64::from(1 << 24),
+            // So small that the objects of a large sample stay below the whole view together.
+            weight: f64::from(random.below(1 << 20)) / f64::from(1 << 30),
             first_state: 0,
             last_state: 0,
         });
@@ -143,6 +144,22 @@ fn cell(id: u32, objects: &[SceneObject], random: &mut Sequence) -> (CellRow, Ve
         let (x, z) = (f64::from(tile[0] + dx) * 10.0, f64::from(tile[1] + dz) * 10.0);
         DVec3::new(x, 1.5 + 0.125 * x, z)
     };
+    let weights = pairs.iter().flat_map(weights_of).collect();
+    let heldout_error_mean = f64::from(random.below(1000)) / f64::from(1 << 22);
+    let effort = CellEffort {
+        segments: 8 + id % 3,
+        runs: 1 + id % 3,
+        lines: id % 5,
+        rows: 64 << (id % 3),
+        solver_rays: 1_000_000 + u64::from(id),
+        refinements: id % 3,
+        heldout_viewpoints: 8192,
+        heldout_rays: 64_000,
+        heldout_error_mean,
+        heldout_error_upper: 2.0 * heldout_error_mean + 0.0001,
+        heldout_error_max: f64::from(random.below(1000)) / f64::from(1 << 20),
+        target_met: id % 4 != 0,
+    };
     let row = CellRow {
         cell: ViewCell {
             id: CellId(id),
@@ -151,13 +168,19 @@ fn cell(id: u32, objects: &[SceneObject], random: &mut Sequence) -> (CellRow, Ve
         },
         tile,
         set,
-        segments: 8,
-        refinements: id % 3,
-        heldout_rays: 64_000,
-        heldout_error_mean: f64::from(random.below(1000)) / f64::from(1 << 22),
-        heldout_error_max: f64::from(random.below(1000)) / f64::from(1 << 20),
+        weights,
+        effort,
     };
     (row, pairs)
+}
+
+/// The weight of an object, shared out unevenly among its visible primitives.
+fn weights_of(pair: &ObjectRow) -> Vec<Weight> {
+    let part = |k: u32| f64::from(k % 7 + 1);
+    let whole: f64 = (0..pair.visible_primitives).map(part).sum();
+    (0..pair.visible_primitives)
+        .map(|k| Weight::from_share(pair.weight * part(k) / whole))
+        .collect()
 }
 
 fn description() -> Description {
