@@ -14,13 +14,11 @@ use crate::process;
 pub const LIMIT: Duration = Duration::from_secs(300);
 
 /// Flags of the bake but scene and folder: a stretch of the street at x = 0, cells of 5 m.
-const STREET: [&str; 10] = [
+const STREET: [&str; 8] = [
     "--region=-5,-10,5,10",
     "--cell-size=5",
     "--eye-height=1.5,1.8",
     "--rows=92",
-    "--heldout-viewpoints=8",
-    "--heldout-rays=2000",
     "--target-error=0.0001",
     "--worst-error=0.001",
     "--rounds=3",

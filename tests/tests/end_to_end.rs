@@ -171,8 +171,7 @@ fn thin_binaries_write_the_bytes_of_bake() {
     let text = "\
         [region]\nrectangles = [[-5.0, -10.0, 5.0, 10.0]]\ncell_size = 5.0\n\
         [solver]\nrows = 92\n\
-        [accuracy]\nheldout_viewpoints = 8\nheldout_rays = 2000\ntarget_error = 0.0001\n\
-        worst_error = 0.001\nrounds = 3\n";
+        [accuracy]\ntarget_error = 0.0001\nworst_error = 0.001\nrounds = 3\n";
     std::fs::write(&config, text).expect("the configuration can be written");
     let cluster = Cluster::start("thin", |dataset, listen| {
         let mut command = Command::new(executable("sightline-coordinator"));
@@ -318,6 +317,42 @@ fn exported_cell_has_the_triangles_of_its_set() {
     let exported = info(&out, &[]);
     let visible = number(&visible["visible_primitives"]);
     assert_eq!(visible, number(&exported["report"]["instanced_triangles"]), "{exported:#}");
+}
+
+#[test]
+fn a_budget_keeps_the_most_important_triangles() {
+    let ask = |budget: &str| {
+        let mut command = sightline(["cell", "--json", "--cell=3", "--budget", budget]);
+        run(command.arg(&baked().dataset)).success().json()["budget"].clone()
+    };
+    let all = ask("1000000");
+    let numbers = |value: &Value| value.as_array().expect("a list").clone();
+    let weights: Vec<f64> =
+        numbers(&all["weights"]).iter().map(|w| w.as_f64().unwrap_or(0.0)).collect();
+    assert!(weights.is_sorted_by(|a, b| a >= b), "the most important first");
+    assert_eq!(number(&all["visible_primitives"]), weights.len() as f64);
+    assert!((0.1..1.1).contains(&number(&all["share_of_all"])), "{}", all["share_of_all"]);
+    let some = ask("50");
+    assert_eq!(numbers(&some["primitives"])[..], numbers(&all["primitives"])[..50]);
+
+    let out = empty("budget").join("cell.glb");
+    let mut command = sightline(["export", "--cell=3", "--budget=50", "-o"]);
+    let _ = run(command.arg(&out).arg(&baked().dataset)).success();
+    assert_eq!(number(&info(&out, &[])["report"]["instanced_triangles"]), 50.0);
+}
+
+#[test]
+fn a_cell_says_what_it_took_and_whether_its_target_was_met() {
+    for entry in entries(baked()) {
+        let cell = info(&baked().dataset, &["--cell", &entry.cell.id.to_string()]);
+        let of = |key: &str| number(&cell[key]);
+        assert!(of("rows") >= 92.0 && of("runs") >= 1.0 && of("segments") >= 4.0, "{cell:#}");
+        assert_eq!(of("segments"), 4.0 * of("runs") + of("lines"));
+        assert!(of("heldout_error_mean") < of("heldout_error_upper"));
+        let met = of("heldout_error_upper") <= 0.0001 && of("heldout_error_max") <= 0.001;
+        assert_eq!(cell["target_met"], met, "{cell:#}");
+        assert!(met || of("refinements") == 3.0, "it goes on while it may: {cell:#}");
+    }
 }
 
 #[test]

@@ -7,7 +7,9 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use glam::DVec3;
 use prost::Message;
+use sightline_geometry::{CellId, ViewCell};
 use sightline_jobs::{BakeConfig, Plan, SceneRef, SkippedCells, TaskId, TiledCell, plan};
 use sightline_proto::encode_plan;
 use sightline_proto::v1::coordinator_server::{Coordinator, CoordinatorServer};
@@ -18,6 +20,7 @@ use sightline_scene::{OpenOptions, Scene};
 use sightline_store::{
     BakeStore, CellRow, ObjectRow, Weight, decode_cell_part, decode_object_part, keys,
 };
+use sightline_worker::solve::{Cancel, CellOutput, solve_cells, solve_segments};
 use sightline_worker::{Worker, WorkerError, WorkerOptions, WorkerSummary};
 use tonic::{Request, Response, Status};
 
@@ -223,6 +226,107 @@ async fn rows_do_not_depend_on_threads_or_on_the_cutting_into_tasks() {
         assert!(whole > 0.0 && whole <= 1.0 + Weight::RELATIVE_ERROR, "{whole}");
         assert_eq!(cell.weights.len() as u64, cell.set.len());
     }
+}
+
+/// A triangle of side 1, three times: 4 m away, 12 m away, and 12 m away at twice the size.
+fn three_triangles(folder: &Path) -> Scene {
+    let corners: [[f32; 3]; 3] = [[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.9, 0.0]];
+    let bytes: Vec<u8> = corners.iter().flatten().flat_map(|x| x.to_le_bytes()).collect();
+    std::fs::write(folder.join("triangle.bin"), bytes).unwrap();
+    let gltf = r#"{ "asset": { "version": "2.0" }, "scene": 0,
+        "scenes": [{ "nodes": [0, 1, 2] }],
+        "nodes": [
+            { "name": "near", "mesh": 0, "translation": [0, 0, -4] },
+            { "name": "far", "mesh": 0, "translation": [-6, 0, -12] },
+            { "name": "large", "mesh": 0, "translation": [6, 0, -12], "scale": [2, 2, 2] }
+        ],
+        "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0 } }] }],
+        "accessors": [{ "bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3",
+            "min": [-0.5, 0, 0], "max": [0.5, 0.9, 0] }],
+        "bufferViews": [{ "buffer": 0, "byteLength": 36 }],
+        "buffers": [{ "uri": "triangle.bin", "byteLength": 36 }] }"#;
+    std::fs::write(folder.join("scene.gltf"), gltf).unwrap();
+    Scene::open(&folder.join("scene.gltf"), &OpenOptions::default()).unwrap()
+}
+
+/// One cell of 1 m at the origin, at height 0.4, finished without tasks.
+fn finish_one(scene: &Scene, config: BakeConfig) -> (CellRow, Vec<ObjectRow>) {
+    let corner = |x: f64, z: f64| DVec3::new(x, 0.4, z);
+    let corners = [corner(-0.5, -0.5), corner(0.5, -0.5), corner(0.5, 0.5), corner(-0.5, 0.5)];
+    let cell = ViewCell { id: CellId(0), corners, height: 0.1 };
+    let tiled = vec![TiledCell { cell, tile: [0, 0] }];
+    let reference =
+        SceneRef { uri: String::new(), name: String::new(), digest: String::new(), files: vec![] };
+    let plan = plan(reference, config, tiled, SkippedCells::default());
+    let never = Cancel::default();
+    let rows = solve_segments(scene, &plan.segments, &plan.config, &never).unwrap();
+    let rows = rows.into_iter().map(|row| (row.segment, row)).collect();
+    let done = solve_cells(scene, &plan.cells, &plan.segments, &rows, &plan.config, &never);
+    let CellOutput { cell, objects } = done.unwrap().remove(0);
+    (cell, objects)
+}
+
+#[test]
+fn nearer_and_larger_triangles_weigh_more_and_near_their_solid_angles() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = three_triangles(folder.path());
+    let mut config = BakeConfig::default();
+    config.solver.rows = 200;
+    config.accuracy.rounds = 0;
+    let (cell, objects) = finish_one(&scene, config);
+    assert_eq!(cell.set.len(), 3);
+    let weight = |name: &str| {
+        let object = scene.objects.iter().find(|o| o.name == name).unwrap();
+        let place = cell.set.iter().position(|p| p.0 == object.primitives.start).unwrap();
+        let share = cell.weights[place].share().unwrap();
+        let own = objects.iter().find(|o| o.object == object.id).unwrap().weight;
+        assert!((share / own - 1.0).abs() <= Weight::RELATIVE_ERROR, "{name}: {share} {own}");
+        own
+    };
+    let (near, far, large) = (weight("near"), weight("far"), weight("large"));
+    assert!(near > large && large > far, "{near} {large} {far}");
+    // Area 0.45 m2 seen head-on from 4 m; four times the area weighs four times as much.
+    let expected = 0.45 / 16.0 / (4.0 * std::f64::consts::PI);
+    assert!((near / expected - 1.0).abs() < 0.1, "{near} {expected}");
+    assert!((large / far - 4.0).abs() < 0.6, "{large} {far}");
+}
+
+#[test]
+fn an_easy_cell_stops_after_its_first_measurement() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = three_triangles(folder.path());
+    let (cell, _) = finish_one(&scene, BakeConfig::default());
+    let effort = cell.effort;
+    assert_eq!((effort.refinements, effort.runs, effort.lines, effort.segments), (0, 1, 0, 4));
+    assert!(effort.target_met && effort.heldout_error_upper <= 0.0002, "{effort:?}");
+    assert!((18_000..25_000).contains(&effort.heldout_viewpoints), "{effort:?}");
+}
+
+#[test]
+fn a_hard_target_gets_more_rows_and_runs_and_says_when_they_were_not_enough() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, plan) = sample(folder.path(), (100, 100));
+    let scene = Scene::open(&path, &OpenOptions::default()).unwrap();
+    let finish = |rounds: u32| {
+        let mut config = plan.config.clone();
+        (config.solver.rows, config.solver.rows_max) = (16, 40);
+        config.accuracy.rounds = rounds;
+        let never = Cancel::default();
+        let rows = solve_segments(&scene, &plan.segments, &config, &never).unwrap();
+        let rows = rows.into_iter().map(|row| (row.segment, row)).collect();
+        let (cells, segments) = (&plan.cells[..1], &plan.segments);
+        solve_cells(&scene, cells, segments, &rows, &config, &never).unwrap().remove(0).cell
+    };
+    let (coarse, refined, again) = (finish(0), finish(2), finish(2));
+    assert_eq!(refined, again, "a function of its input alone");
+    let [a, b] = [&coarse.effort, &refined.effort];
+    assert!(!a.target_met && a.refinements == 0 && a.heldout_error_upper > 0.0002, "{a:?}");
+    assert!(b.refinements >= 1 && b.segments == 4 * b.runs + b.lines, "{b:?}");
+    assert!(b.rows > a.rows && b.rows <= 40 && b.solver_rays > a.solver_rays, "{b:?}");
+    assert!(b.heldout_error_mean < a.heldout_error_mean, "{a:?} {b:?}");
+    assert!(b.target_met || b.refinements == 2, "{b:?}");
+    let members: Vec<_> = coarse.set.iter().collect();
+    assert!(members.iter().all(|p| refined.set.contains(*p)), "nothing is lost");
 }
 
 #[tokio::test]

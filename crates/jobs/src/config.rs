@@ -79,8 +79,11 @@ impl fmt::Display for Heights {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SolverConfig {
-    /// Rows of a face of the rectified frame; a face has as many columns.
+    /// Rows of a face of the rectified frame, for the segments that cells share; a face has as
+    /// many columns.
     pub rows: u32,
+    /// Most rows that refinement may give to a segment of one cell.
+    pub rows_max: u32,
     /// Horizontal perimeters of a cell that are solved, from the lower to the upper eye height.
     pub rings: u32,
     /// Whether the vertical edges of a cell are solved too.
@@ -95,14 +98,6 @@ pub struct AccuracyConfig {
     pub target_error: f64,
     /// Pixel error aimed at for the worst held-out viewpoint of a cell, share of pixels.
     pub worst_error: f64,
-    /// Held-out viewpoints a cell.
-    pub heldout_viewpoints: u32,
-    /// Rays a held-out viewpoint.
-    pub heldout_rays: u32,
-    /// Viewpoints that look for pockets in a cell that geometry reaches into.
-    pub scouts: u32,
-    /// Rays a scout.
-    pub scout_rays: u32,
     /// Refinement rounds at most; 0 switches refinement off.
     pub rounds: u32,
 }
@@ -138,21 +133,13 @@ impl Default for RegionConfig {
 
 impl Default for SolverConfig {
     fn default() -> Self {
-        Self { rows: 200, rings: 2, verticals: false }
+        Self { rows: 80, rows_max: 512, rings: 1, verticals: false }
     }
 }
 
 impl Default for AccuracyConfig {
     fn default() -> Self {
-        Self {
-            target_error: 0.0002,
-            worst_error: 0.002,
-            heldout_viewpoints: 16,
-            heldout_rays: 2000,
-            scouts: 1024,
-            scout_rays: 32,
-            rounds: 4,
-        }
+        Self { target_error: 0.0002, worst_error: 0.002, rounds: 8 }
     }
 }
 
@@ -244,18 +231,26 @@ pub const KEYS: &[KeyDoc] = &[
     key(
         "solver.rows",
         "integer",
-        "200",
+        "80",
         "rows a face",
-        "Rows of a face of the image; a face has as many columns. \
-         More rows find smaller primitives and cost more time.",
+        "Rows of a face of the image, for the segments that cells share; a face has as many \
+         columns. Cells that need more get it by refinement; without refinement, more rows find \
+         smaller primitives and cost more time.",
+    ),
+    key(
+        "solver.rows_max",
+        "integer",
+        "512",
+        "rows a face",
+        "Most rows that refinement may give to a segment of one cell.",
     ),
     key(
         "solver.rings",
         "integer",
-        "2",
+        "1",
         "perimeters a cell",
-        "Horizontal perimeters of a cell that are solved, spread from the lowest to the highest \
-         eye position; 1 stands for the middle.",
+        "Horizontal perimeters of a cell that cells share, spread from the lowest to the highest \
+         eye position; 1 stands for the middle. Refinement adds others where they are needed.",
     ),
     key(
         "solver.verticals",
@@ -269,8 +264,9 @@ pub const KEYS: &[KeyDoc] = &[
         "number",
         "0.0002",
         "share of pixels",
-        "Mean pixel error of a cell that refinement aims at. A cell is refined until held-out \
-         viewpoints say with 95 % confidence that it is met, or accuracy.rounds are used up.",
+        "Mean pixel error of a cell that is aimed at. Resolution, runs and lines are chosen cell by \
+         cell until held-out viewpoints say with 95 % confidence that it is met, or \
+         accuracy.rounds are used up.",
     ),
     key(
         "accuracy.worst_error",
@@ -280,40 +276,12 @@ pub const KEYS: &[KeyDoc] = &[
         "Pixel error at the worst held-out viewpoint of a cell that refinement aims at.",
     ),
     key(
-        "accuracy.heldout_viewpoints",
-        "integer",
-        "16",
-        "viewpoints a cell",
-        "Viewpoints in a cell where its error is measured; they are never solved from.",
-    ),
-    key(
-        "accuracy.heldout_rays",
-        "integer",
-        "2000",
-        "rays a viewpoint",
-        "Rays that measure the error at one held-out viewpoint.",
-    ),
-    key(
-        "accuracy.scouts",
-        "integer",
-        "1024",
-        "viewpoints a cell",
-        "Viewpoints that look for pockets which the perimeter does not see into, such as the inside \
-         of furniture. Only in cells that geometry reaches into; 0 for none.",
-    ),
-    key(
-        "accuracy.scout_rays",
-        "integer",
-        "32",
-        "rays a viewpoint",
-        "Rays of one scout; a single wrong one makes it a suspect that is measured in full.",
-    ),
-    key(
         "accuracy.rounds",
         "integer",
-        "4",
+        "8",
         "rounds",
-        "Refinement rounds of a cell at most; 0 switches refinement off.",
+        "Refinement rounds of a cell at most; 0 measures and refines nothing, so that all segments \
+         have solver.rows.",
     ),
     key(
         "tasks.segments_per_task",
@@ -541,14 +509,21 @@ impl SolverConfig {
             "solver.rows",
             &self.rows,
             "is out of range",
-            "use 2 to 16384 rows; 100 to 400 suit most scenes",
+            "use 2 to 16384 rows; 80 suit most scenes, 100 to 400 where nothing is refined",
+        )?;
+        require(
+            (self.rows..=ROWS_MAX).contains(&self.rows_max),
+            "solver.rows_max",
+            &self.rows_max,
+            "is out of range",
+            "use at least solver.rows and at most 16384",
         )?;
         require(
             (1..=RINGS_MAX).contains(&self.rings),
             "solver.rings",
             &self.rings,
             "is out of range",
-            "use 1 to 64 perimeters; 2 suit most scenes",
+            "use 1 to 64 perimeters; 1 suits most scenes",
         )
     }
 }
@@ -582,21 +557,7 @@ impl AccuracyConfig {
             "accuracy.rounds",
             &self.rounds,
             "is out of range",
-            "use at most 1000; 4 suit most scenes",
-        )?;
-        require(
-            self.rounds == 0 || self.heldout_viewpoints > 0,
-            "accuracy.heldout_viewpoints",
-            &self.heldout_viewpoints,
-            "leaves nothing to measure the error with",
-            "use at least 1, or set accuracy.rounds = 0",
-        )?;
-        require(
-            self.rounds == 0 || self.heldout_rays > 0,
-            "accuracy.heldout_rays",
-            &self.heldout_rays,
-            "leaves nothing to measure the error with",
-            "use at least 1, or set accuracy.rounds = 0",
+            "use at most 1000; 8 suit most scenes",
         )
     }
 }
@@ -844,7 +805,8 @@ mod tests {
             ("[solver]\nrings = 0\n", "solver.rings"),
             ("[accuracy]\ntarget_error = 0.0\n", "accuracy.target_error"),
             ("[accuracy]\nworst_error = 0.0001\n", "accuracy.worst_error"),
-            ("[accuracy]\nheldout_rays = 0\n", "accuracy.heldout_rays"),
+            ("[accuracy]\nrounds = 2000\n", "accuracy.rounds"),
+            ("[solver]\nrows = 600\n", "solver.rows_max"),
             ("[tasks]\nsegments_per_task = 0\n", "tasks.segments_per_task"),
         ] {
             match from(rest) {

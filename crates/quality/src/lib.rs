@@ -21,7 +21,9 @@ mod depth_tie;
 mod directions;
 mod measure;
 mod membership;
+mod scattered;
 mod seed;
+mod sequential;
 
 pub use depth_tie::ties;
 pub use measure::{
@@ -29,4 +31,6 @@ pub use measure::{
     random_viewpoints,
 };
 pub use membership::Members;
+pub use scattered::{SCATTERED_BATCH, measure_scattered};
 pub use seed::{SplitMix64, viewpoint_seed};
+pub use sequential::{ErrorTest, Verdict};

@@ -53,22 +53,6 @@ impl CellError {
         sum / self.viewpoints.len().max(1) as f64
     }
 
-    /// Upper end of the one-sided 95 % confidence interval of the mean error over all viewpoints of
-    /// the cell, of which these are a sample; the mean itself when there is but one.
-    ///
-    /// Student's t, with its quantile approximated as 1.645 + 1.6 / (n - 1): within 1 % from 12
-    /// viewpoints on, and too small below.
-    #[must_use]
-    pub fn mean_upper_bound(&self) -> f64 {
-        let (n, mean) = (self.viewpoints.len() as f64, self.mean());
-        if n < 2.0 {
-            return mean;
-        }
-        let squares: f64 = self.viewpoints.iter().map(|v| (v.error - mean).powi(2)).sum();
-        let quantile = 1.645 + 1.6 / (n - 1.0);
-        mean + quantile * (squares / (n - 1.0) / n).sqrt()
-    }
-
     /// Largest error of a viewpoint, in [0, 1]; 0 without viewpoints.
     #[must_use]
     pub fn max(&self) -> f64 {
@@ -207,7 +191,7 @@ fn measure(
 
 /// A ray caster and the see-through hits of the current ray.
 #[derive(Default)]
-struct Tracer {
+pub(crate) struct Tracer {
     caster: RayCaster,
     missing: Vec<Hit>,
     present: Vec<Hit>,
@@ -215,7 +199,12 @@ struct Tracer {
 
 impl Tracer {
     /// The definition of the crate's documentation.
-    fn is_wrong(&mut self, geometry: &InstancedGeometry, members: &Members, ray: Ray) -> bool {
+    pub(crate) fn is_wrong(
+        &mut self,
+        geometry: &InstancedGeometry,
+        members: &Members,
+        ray: Ray,
+    ) -> bool {
         let nearest = self.caster.closest_occluder(geometry, ray, f64::INFINITY, |_| true);
         if let Some(hit) = nearest
             && !members.contains(hit.primitive)

@@ -6,7 +6,8 @@ use sightline_geometry::{
     ViewCell,
 };
 use sightline_quality::{
-    CellError, ViewpointError, measure_cell, measure_viewpoint, random_viewpoints, viewpoint_seed,
+    Members, SCATTERED_BATCH, measure_cell, measure_scattered, measure_viewpoint,
+    random_viewpoints, viewpoint_seed,
 };
 
 const RAYS: u32 = 200_000;
@@ -210,24 +211,25 @@ fn many_rays_are_taken_in_batches() {
 }
 
 #[test]
-fn the_confidence_bound_is_that_of_students_t() {
-    let viewpoint = |error: f64| ViewpointError {
-        viewpoint: DVec3::ZERO,
-        seed: 0,
-        rays: 1000,
-        wrong: (1000.0 * error) as u32,
-        error,
+fn single_rays_measure_the_mean_error_of_the_cell() {
+    let scene = geometry(vec![room(5.0, DVec3::ZERO), panel(DVec3::ZERO, true)]);
+    let set = all_but(&scene, &[12]);
+    let expected = measure_cell(&scene, &set, &cell(), 200, 2000, 1).mean();
+    let members = Members::new(&set, scene.primitive_count());
+    let scattered = |seed| -> Vec<DVec3> {
+        (0..20).flat_map(|b| measure_scattered(&scene, &members, &cell(), b, seed)).collect()
     };
-    let of = |errors: &[f64]| CellError {
-        cell: CellId(0),
-        viewpoints: errors.iter().copied().map(viewpoint).collect(),
-    };
-    // Eight of 0.1 and eight of 0.3: s = 0.2 sqrt(4/15), t(0.95, 15) = 1.753.
-    let errors = [[0.1; 8], [0.3; 8]].concat();
-    let expected = 0.2 + 1.753 * 0.1 * (16.0f64 / 15.0).sqrt() / 4.0;
-    let bound = of(&errors).mean_upper_bound();
-    assert!((bound - expected).abs() < 1e-4, "{bound} {expected}");
-    assert_eq!(of(&[0.1; 16]).mean_upper_bound(), of(&[0.1; 16]).mean());
-    assert_eq!(of(&[0.25]).mean_upper_bound(), 0.25);
-    assert_eq!(of(&[]).mean_upper_bound(), 0.0);
+    let wrong = scattered(1);
+    let rays = f64::from(20 * SCATTERED_BATCH);
+    let found = wrong.len() as f64 / rays;
+    assert!((found - expected).abs() < 5.0 * (expected / rays).sqrt(), "{found} {expected}");
+    assert!(wrong.iter().all(|&p| cell().contains(p)));
+    assert!(wrong.windows(2).all(|w| w[0] != w[1]), "every ray has a viewpoint of its own");
+    assert_ne!(wrong, scattered(2));
+    for threads in [1, 3] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        assert_eq!(pool.install(|| scattered(1)), wrong, "the same on {threads} threads");
+    }
+    let all = Members::new(&all_but(&scene, &[]), scene.primitive_count());
+    assert!(measure_scattered(&scene, &all, &cell(), 0, 1).is_empty());
 }

@@ -105,13 +105,13 @@ mod tests {
     #[test]
     fn changed_keys_are_named_with_both_values() {
         let old = config_json(&config("cell_size = 10.0"));
-        let new = config_json(&config("cell_size = 5.0\nground_from = 2.0\n[solver]\nrows = 64"));
+        let new = config_json(&config("cell_size = 5.0\nground_from = 2.0\n[solver]\nrows = 104"));
         assert_eq!(
             changed_keys(&old, &new),
             [
                 "region.cell_size changed from 10.0 to 5.0",
                 "region.ground_from changed from absent to 2.0",
-                "solver.rows changed from 200 to 64",
+                "solver.rows changed from 80 to 104",
             ]
         );
         assert!(changed_keys(&old, &old).is_empty());

@@ -95,7 +95,8 @@ pub fn run(command: &Verify) -> Result<()> {
         return Ok(());
     }
     Err(Failure::new(Kind::Negative, exceeded.join("; ")).with_help(
-        "bake with more solver.rows, a smaller accuracy.target_error or more accuracy.rounds",
+        "bake with a smaller --target-error or more --rounds; `sightline info` tells whether the \
+         bake's own target was met",
     ))
 }
 
