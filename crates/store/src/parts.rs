@@ -1,4 +1,4 @@
-//! Parts: what tasks write while a bake runs. One Parquet object each, see `schemas/parts-v1.md`.
+//! Parts: what tasks write while a bake runs. One Parquet object each, see `schemas/parts-v2.md`.
 //!
 //! A segments task writes one file of [`SegmentRow`]s; a cells task writes one of [`CellRow`]s and
 //! one of [`ObjectRow`]s. Equal rows give equal bytes (ST-1), so attempts of one task agree.

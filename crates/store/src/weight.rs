@@ -19,7 +19,7 @@ const STEPS: i32 = 4;
 
 /// 2^(j / 4).
 const POWERS: [f64; STEPS as usize] =
-    [1.0, 1.189_207_115_002_721_1, std::f64::consts::SQRT_2, 1.681_792_830_507_429];
+    [1.0, 1.189_207_115_002_721, std::f64::consts::SQRT_2, 1.681_792_830_507_429];
 
 /// 2^((2 j + 1) / 8): from here on, the next code is nearer.
 const BORDERS: [f64; STEPS as usize] = [

@@ -524,9 +524,10 @@ pub(crate) fn check_weights(
         let factor = 1.0 + Weight::RELATIVE_ERROR + SUM_ROUNDING;
         let lowest = Weight::from_code(1).share().unwrap_or(0.0);
         let slack = lowest * f64::from(pair.visible_primitives);
-        let fits = pair.weight <= sum * factor + slack && sum <= pair.weight * factor + slack;
         // See-through primitives of one object may cover each other: their sum is cut at 1.
-        if !fits && !(pair.weight >= 1.0 && sum >= 1.0 / factor) {
+        let not_less = pair.weight >= 1.0 || sum <= pair.weight * factor + slack;
+        let not_more = pair.weight <= sum * factor + slack;
+        if !(not_less && not_more) {
             return Err(format!(
                 "the weights of the primitives of object {} in cell {cell} add up to {sum:.3e}, \
                  and its row says {:.3e}; {REPAIR}",

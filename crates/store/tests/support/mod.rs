@@ -158,7 +158,7 @@ fn cell(id: u32, objects: &[SceneObject], random: &mut Sequence) -> (CellRow, Ve
         heldout_error_mean,
         heldout_error_upper: 2.0 * heldout_error_mean + 0.0001,
         heldout_error_max: f64::from(random.below(1000)) / f64::from(1 << 20),
-        target_met: id % 4 != 0,
+        target_met: !id.is_multiple_of(4),
     };
     let row = CellRow {
         cell: ViewCell {
