@@ -26,8 +26,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 use sightline_geometry::{
-    FACE_COUNT, PrimitiveSet, Sampling, SegmentId, ViewCell, ViewSegment,
-    overlap::primitives_in_cell,
+    PrimitiveSet, Sampling, SegmentId, ViewCell, ViewSegment, overlap::primitives_in_cell,
 };
 use sightline_jobs::{BakeConfig, PlannedCell};
 use sightline_quality::{
@@ -199,7 +198,8 @@ impl Sight<'_> {
         self.solve(&segments);
     }
 
-    /// Solves segments of the cell alone, at the rows of the finest run.
+    /// Solves segments of the cell alone, at the rows of the finest run, and finer where they see what
+    /// is not known yet.
     fn solve(&mut self, segments: &[ViewSegment]) {
         let sampling = Sampling::new(self.rows);
         let first = self.extra.len() as u32;
@@ -210,9 +210,13 @@ impl Sight<'_> {
             .collect();
         let seen: Vec<Extra> = numbered
             .into_par_iter()
-            .map(|segment| Extra { row: solve_segment(self.scene, &segment, sampling), segment })
+            .map(|segment| {
+                let known = Some(&self.set);
+                let row = solve_segment(self.scene, &segment, sampling, self.config, known);
+                Extra { row, segment }
+            })
             .collect();
-        self.solver_rays += seen.len() as u64 * rays_of(sampling);
+        self.solver_rays += seen.iter().map(|e| e.row.rays).sum::<u64>();
         self.set = PrimitiveSet::union(seen.iter().map(|e| &e.row.set).chain([&self.set]));
         self.extra.extend(seen);
     }
@@ -242,7 +246,7 @@ pub fn finish_cell(
         rows: sampling.rows(),
         runs_at: planned_levels(config.solver.rings),
         before_run: None,
-        solver_rays: solved.len() as u64 * rays_of(sampling),
+        solver_rays: solved.iter().map(|(_, row)| row.rays).sum(),
         heldout_rays: 0,
     };
     let mut round = 0;
@@ -280,11 +284,6 @@ pub fn finish_cell(
     let (set, weights) = (sight.set, weights.codes());
     let cell = CellRow { cell: cell.clone(), tile: planned.tile, set, weights, effort };
     CellOutput { objects, cell }
-}
-
-/// Rays of the grid of one segment.
-fn rays_of(sampling: Sampling) -> u64 {
-    FACE_COUNT as u64 * u64::from(sampling.rows()) * u64::from(sampling.columns())
 }
 
 /// Segments of one cell alone have no number in the plan. Theirs count down from the last, a stretch

@@ -7,9 +7,10 @@
 use std::collections::BTreeMap;
 
 use rayon::prelude::*;
-use sightline_geometry::{Sampling, SegmentId, ViewSegment};
+use sightline_geometry::{PrimitiveSet, Sampling, SegmentId, ViewSegment};
 use sightline_jobs::{BakeConfig, PlannedCell};
 use sightline_scene::Scene;
+use sightline_solver::{SolveOptions, solve_segment_with};
 use sightline_store::{CellRow, ObjectRow, SegmentRow};
 
 use crate::cell::finish_cell;
@@ -26,17 +27,43 @@ pub fn solve_segments(
     let sampling = Sampling::new(config.solver.rows);
     segments
         .par_iter()
-        .map(|segment| (!cancel.is_cancelled()).then(|| solve_segment(scene, segment, sampling)))
+        .map(|segment| {
+            (!cancel.is_cancelled()).then(|| solve_segment(scene, segment, sampling, config, None))
+        })
         .collect()
 }
 
+/// Passes of finer rays within a solve: the last has 16 times the rows of the first.
+const PASSES: u32 = 4;
+
+/// A tile is refined when more than this part of the target error may be missing in it.
+const TILE_SHARE: f64 = 1.0 / 32.0;
+
 /// The one place that calls the solver. Segments differ in where the rays of their pixels are:
-/// neighbours on one line would otherwise share their rows.
+/// neighbours on one line would otherwise share their rows. Without refinement by rounds, there is
+/// none by rays.
 #[must_use]
-pub fn solve_segment(scene: &Scene, segment: &ViewSegment, sampling: Sampling) -> SegmentRow {
+pub fn solve_segment(
+    scene: &Scene,
+    segment: &ViewSegment,
+    sampling: Sampling,
+    config: &BakeConfig,
+    known: Option<&PrimitiveSet>,
+) -> SegmentRow {
     let sampling = sampling.jittered(segment.id.0);
-    let found = sightline_solver::solve_segment(&scene.geometry, segment, sampling);
-    SegmentRow { segment: segment.id, set: found.set, weights: found.weights }
+    let options = SolveOptions {
+        passes: if config.accuracy.rounds > 0 { PASSES } else { 0 },
+        threshold: TILE_SHARE * config.accuracy.target_error,
+        known,
+        ..SolveOptions::default()
+    };
+    let found = solve_segment_with(&scene.geometry, segment, sampling, &options);
+    SegmentRow {
+        segment: segment.id,
+        set: found.set,
+        weights: found.weights,
+        rays: found.statistics.rays,
+    }
 }
 
 /// The rows of the dataset for one cell.

@@ -119,7 +119,7 @@ mod tests {
 
     fn row(members: &[u32], weights: &[f32]) -> SegmentRow {
         let set = PrimitiveSet::from_sorted(members.iter().copied());
-        SegmentRow { segment: SegmentId(0), set, weights: weights.to_vec() }
+        SegmentRow { segment: SegmentId(0), set, weights: weights.to_vec(), rays: 64 }
     }
 
     #[test]

@@ -16,6 +16,8 @@ pub struct SegmentRow {
     /// One weight a member, in ascending order of the members: the share of (solid angle x
     /// segment) on which the member is nearest, in [0, 1].
     pub weights: Vec<f32>,
+    /// Rays along which it was solved.
+    pub rays: u64,
 }
 
 /// What one view cell sees, and how well that was established.
@@ -43,10 +45,10 @@ pub struct CellEffort {
     pub runs: u32,
     /// Of these, lines through viewpoints where a pocket was found.
     pub lines: u32,
-    /// Rows of a face of the finest run.
+    /// Rows of a face of the finest run's first pass.
     pub rows: u32,
-    /// Rays of the grid over all segments: 4 faces x rows x columns each. A shared segment counts
-    /// for each of its cells.
+    /// Rays along which the segments were solved, finer ones included. A shared segment counts for
+    /// each of its cells.
     pub solver_rays: u64,
     /// Refinement rounds that were run.
     pub refinements: u32,

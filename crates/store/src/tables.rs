@@ -114,7 +114,7 @@ const CELL_COLUMNS: &[Column] = &[
     ("runs", Kind::U32, "of these, runs along the perimeter"),
     ("lines", Kind::U32, "of these, lines through viewpoints"),
     ("rows", Kind::U32, "rows of a face of the finest run"),
-    ("solver_rays", Kind::U64, "rays of the grid over all segments"),
+    ("solver_rays", Kind::U64, "rays along which the segments were solved"),
     ("refinements", Kind::U32, "refinement rounds"),
     ("heldout_viewpoints", Kind::U32, "viewpoints of the last measurement"),
     ("heldout_rays", Kind::U64, "rays cast from held-out viewpoints, in all rounds"),
@@ -141,7 +141,7 @@ const CELL_COLUMNS_OF_2: &[&str] = &[
 /// What segments tasks write.
 pub(crate) const SEGMENT_PART: Table = Table {
     format: "sightline-part-segments",
-    version: 1,
+    version: 2,
     added: &[],
     row_group_rows: 64,
     columns: &[
@@ -158,6 +158,7 @@ pub(crate) const SEGMENT_PART: Table = Table {
             "one a visible primitive, ascending: share of (solid angle x segment) on which it is \
              nearest",
         ),
+        ("rays", Kind::U64, "rays along which the segment was solved"),
     ],
 };
 
@@ -581,6 +582,7 @@ pub(crate) fn segment_batch(row: &SegmentRow) -> Result<RecordBatch> {
         numbers::<UInt32Type>([count(&row.set)].into_iter()),
         sets([&row.set].into_iter()),
         Arc::new(weights.finish()),
+        numbers::<UInt64Type>([row.rays].into_iter()),
     ])
 }
 
@@ -795,6 +797,7 @@ pub(crate) fn segment_rows(
     let sizes = columns.u32s("primitives")?;
     let sets = columns.get::<BinaryArray>("set")?;
     let weights = columns.get::<ListArray>("weights")?;
+    let rays = columns.numbers::<UInt64Type>("rays")?;
     for (row, &id) in ids.iter().enumerate() {
         let segment = SegmentId(id);
         if !wanted(segment) {
@@ -808,7 +811,7 @@ pub(crate) fn segment_rows(
             let problem = format!("segment {segment} has not one weight a primitive");
             return Err(StoreError::corrupt(file, problem));
         }
-        rows.push(SegmentRow { segment, set, weights });
+        rows.push(SegmentRow { segment, set, weights, rays: rays[row] });
     }
     Ok(())
 }

@@ -213,7 +213,7 @@ pub fn segments(count: u32) -> Vec<SegmentRow> {
             first = end + 1 + random.below(100);
         }
         let weights = (0..set.len()).map(|_| random.below(1 << 20) as f32 / 1e9).collect();
-        SegmentRow { segment: SegmentId(3 * id), set, weights }
+        SegmentRow { segment: SegmentId(3 * id), set, weights, rays: u64::from(1000 + id) }
     };
     (0..count).map(row).collect()
 }
