@@ -133,7 +133,7 @@ impl Default for RegionConfig {
 
 impl Default for SolverConfig {
     fn default() -> Self {
-        Self { rows: 80, rows_max: 512, rings: 1, verticals: false }
+        Self { rows: 32, rows_max: 512, rings: 1, verticals: false }
     }
 }
 
