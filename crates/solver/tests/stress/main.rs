@@ -69,6 +69,14 @@ agree_with_the_twins! {
     scaled_sheared_and_mirrored_instances_are_what_the_twins_say: "instances",
 }
 
+/// Formerly failing: the bounds knew how far a vertex is from the viewer, not how large the products
+/// are that put it there.
+#[test]
+fn what_rounds_away_in_placing_a_mesh_is_in_the_bounds() {
+    let tally = run(family("mesh-offset").expect("the family exists"), 192);
+    assert!(tally.unexplained.is_empty(), "{}", tally.unexplained.join("\n"));
+}
+
 #[test]
 fn every_family_has_a_promise() {
     let names: Vec<&str> = FAMILIES.iter().map(|f| f.name).collect();
