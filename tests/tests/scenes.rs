@@ -30,13 +30,8 @@ const HOSPITAL_INSTANCED: &str = "indoor/hospital_three_floors_gpuinst.glb";
 const QUAKE: &str = "indoor/lq_e1m1.glb";
 
 /// A room on the lowest floor, below its ceiling.
-const WARD: [&str; 5] = [
-    "--region=-6,-2,0,2",
-    "--cell-size=2",
-    "--heights=absolute",
-    "--eye-height=1.5,1.8",
-    "--rows=92",
-];
+const WARD: [&str; 4] =
+    ["--region=-6,-2,0,2", "--cell-size=2", "--heights=absolute", "--eye-height=1.5,1.8"];
 
 /// Bakes are large; one at a time keeps memory and time predictable.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
@@ -80,7 +75,7 @@ fn assert_promise((out, summary): &(PathBuf, Value), cells: f64) {
 fn a_street_of_linz_keeps_its_promise() {
     let test = "a_street_of_linz_keeps_its_promise";
     let Some(scene) = scenes::shared(test, LINZ) else { return };
-    let flags = ["--region=-40,-40,-10,-10", "--ground=ground_derived*", "--rows=92"];
+    let flags = ["--region=-40,-40,-10,-10", "--ground=ground_derived*"];
     alone(|| assert_promise(&bake("linz", &scene, &flags), 9.0));
 }
 
@@ -88,7 +83,7 @@ fn a_street_of_linz_keeps_its_promise() {
 fn rotterdam_without_ground_keeps_its_promise() {
     let test = "rotterdam_without_ground_keeps_its_promise";
     let Some(scene) = scenes::shared(test, ROTTERDAM) else { return };
-    let flags = ["--region=-40,-40,-10,-10", "--heights=absolute", "--rows=142"];
+    let flags = ["--region=-40,-40,-10,-10", "--heights=absolute"];
     alone(|| {
         let baked = bake("rotterdam", &scene, &flags);
         assert_promise(&baked, 8.0);
@@ -107,7 +102,7 @@ fn a_hospital_ward_keeps_its_promise() {
 fn a_game_level_keeps_its_promise() {
     let test = "a_game_level_keeps_its_promise";
     let Some(scene) = scenes::shared(test, QUAKE) else { return };
-    let flags = ["--region=0,-5,10,0", "--cell-size=2.5", "--ground-from=6", "--rows=92"];
+    let flags = ["--region=0,-5,10,0", "--cell-size=2.5", "--ground-from=6"];
     alone(|| assert_promise(&bake("quake", &scene, &flags), 8.0));
 }
 

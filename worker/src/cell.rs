@@ -55,10 +55,13 @@ const SUSPECT_RAYS: u32 = 2048;
 /// evenly has suspects of about the mean, a pocket in a fifth of the cell has five times as much.
 const POCKET: f64 = 4.0;
 
-/// Where the mean error is so many times the target, the next run has half as many rows again as
-/// the finest before it, elsewhere a quarter. Most of what a run gains comes from its rays being
-/// elsewhere, and its cost grows with the square of its rows.
-const FAR_OFF: f64 = 4.0;
+/// Where the mean error is so many times the target, the next run has twice the rows of the finest
+/// before it.
+const FAR_OFF: f64 = 16.0;
+
+/// Where it is so many times the target, half as many rows again; elsewhere a quarter. Most of what
+/// a run gains comes from its rays being elsewhere, and its cost grows with the square of its rows.
+const OFF: f64 = 4.0;
 
 /// A run helped when it left at most this part of the mean error. One that meets what is spread
 /// thin leaves a tenth.
@@ -188,8 +191,7 @@ impl Sight<'_> {
     /// Solves another run along the perimeter, at the height where most of `wrong` are.
     fn run(&mut self, wrong: &[f64], mean: f64) {
         let limit = Sampling::new(self.config.solver.rows_max).rows();
-        let far_off = mean > FAR_OFF * self.config.accuracy.target_error;
-        let more = self.rows + self.rows / if far_off { 2 } else { 4 };
+        let more = more_rows(self.rows, mean / self.config.accuracy.target_error);
         self.rows = Sampling::new(more).rows().min(limit);
         let level = next_level(wrong, self.runs_at);
         self.runs_at[level] += 1;
@@ -284,6 +286,17 @@ pub fn finish_cell(
     let (set, weights) = (sight.set, weights.codes());
     let cell = CellRow { cell: cell.clone(), tile: planned.tile, set, weights, effort };
     CellOutput { objects, cell }
+}
+
+/// Rows of the next run, behind one of `rows` rows that left so many times the target.
+fn more_rows(rows: u32, times_target: f64) -> u32 {
+    if times_target > FAR_OFF {
+        2 * rows
+    } else if times_target > OFF {
+        rows + rows / 2
+    } else {
+        rows + rows / 4
+    }
 }
 
 /// Segments of one cell alone have no number in the plan. Theirs count down from the last, a stretch
@@ -385,6 +398,12 @@ mod tests {
         assert_eq!(next_level(&[0.1, 0.05, 0.0, 0.9], [9, 1, 0]), 2, "the bottom was solved often");
         assert_eq!(next_level(&[0.5; 9], [0, 3, 0]), 1, "a flat cell has its middle only");
         assert_eq!(next_level(&[], [1, 1, 1]), 1);
+    }
+
+    #[test]
+    fn rows_grow_faster_the_farther_the_target_is() {
+        let rows = [1.0, 5.0, 20.0].map(|times_target| more_rows(80, times_target));
+        assert_eq!(rows, [100, 120, 160]);
     }
 
     #[test]

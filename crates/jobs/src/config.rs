@@ -231,7 +231,7 @@ pub const KEYS: &[KeyDoc] = &[
     key(
         "solver.rows",
         "integer",
-        "80",
+        "32",
         "rows a face",
         "Rows of a face of the image, for the segments that cells share; a face has as many \
          columns. Cells that need more get it by refinement; without refinement, more rows find \
@@ -509,7 +509,7 @@ impl SolverConfig {
             "solver.rows",
             &self.rows,
             "is out of range",
-            "use 2 to 16384 rows; 80 suit most scenes, 100 to 400 where nothing is refined",
+            "use 2 to 16384 rows; 32 suit most scenes, 100 to 400 where nothing is refined",
         )?;
         require(
             (self.rows..=ROWS_MAX).contains(&self.rows_max),

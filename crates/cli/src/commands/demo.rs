@@ -16,8 +16,6 @@ use crate::report::{bytes, print, thousands};
 const CELL_SIZE: f64 = 5.0;
 /// Cells along x and z. A cell takes a few core-seconds to bake and one to verify.
 const CELLS: [u32; 2] = [2, 14];
-/// Rows of a face: enough for a mean pixel error under 0.02 % in this city.
-const ROWS: u32 = 144;
 
 pub fn run(command: &Demo) -> Result<()> {
     let folder = &command.out;
@@ -75,7 +73,6 @@ fn configuration(region: [f64; 4], eyes: [f64; 2]) -> ConfigFlags {
             ("region.rectangles", format!("[{stretch:?}]")),
             ("region.cell_size", format!("{CELL_SIZE:?}")),
             ("region.eye_height", format!("{eyes:?}")),
-            ("solver.rows", ROWS.to_string()),
             // The eye heights are close together: one perimeter, in the middle, is enough.
             ("solver.rings", "1".into()),
             // Small tasks, so that progress is seen; the dataset does not depend on them.
