@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use sightline_tests::sources::{self, Line};
 use sightline_tests::workspace::{self, Workspace};
 
-/// Modules that may hold unsafe code, with the reason beside them. None needs it.
-/// `tile`: the call of what is compiled for AVX2, behind the question whether the processor has it.
-const UNSAFE_MODULES: [&str; 1] = ["crates/solver/src/tile.rs"];
+/// Modules that may hold unsafe code: they call what is compiled for AVX2, once the processor has
+/// said that it has it.
+const UNSAFE_MODULES: [&str; 2] = ["crates/geometry/src/raycast.rs", "crates/solver/src/tile.rs"];
 
 /// Crates that are plain functions of their arguments.
 const PURE: [&str; 4] = ["geometry", "solver", "quality", "jobs"];

@@ -37,7 +37,7 @@ pub fn solve_segments(
 const PASSES: u32 = 4;
 
 /// A tile is refined when more than this part of the target error may be missing in it.
-const TILE_SHARE: f64 = 1.0 / 32.0;
+const TILE_SHARE: f64 = 1.0 / 128.0;
 
 /// The one place that calls the solver. Segments differ in where the rays of their pixels are:
 /// neighbours on one line would otherwise share their rows. Without refinement by rounds, there is

@@ -101,6 +101,13 @@ impl Bounds32 {
         b
     }
 
+    /// Half the surface area; in `f64`, where it neither over- nor underflows. 0 for the empty box.
+    #[must_use]
+    pub fn half_area(&self) -> f64 {
+        let [x, y, z] = [0, 1, 2].map(|k| f64::from(self.max[k]) - f64::from(self.min[k]));
+        if x < 0.0 { 0.0 } else { x * y + y * z + z * x }
+    }
+
     /// The same box in `f64`.
     #[must_use]
     pub fn widen(self) -> Bounds {

@@ -14,7 +14,7 @@
 //! - leaves cover the items `0..n` once each, in order of [`Hierarchy::build`]'s permutation;
 //! - a node's box contains the boxes of its children and items.
 
-use crate::{Bounds, Bounds32};
+use crate::{Bounds, Bounds32, wide::WideHierarchy};
 
 /// One node, 32 bytes. `count == 0`: inner, children `first` and `first + 1`.
 /// `count > 0`: leaf over the items `first..first + count`.
@@ -44,13 +44,18 @@ pub struct Hierarchy {
     pub nodes: Vec<Node>,
     /// Largest number of nodes on a path from the root to a leaf; a walk's stack needs no more.
     pub depth: usize,
+    /// The same with four children a node, for rays.
+    pub(crate) wide: WideHierarchy,
 }
 
 /// Bins an axis; more make trees hardly better.
 const BINS: usize = 16;
 
-/// A leaf holds at most this many items.
-const LEAF_ITEMS: usize = 4;
+/// A leaf holds at most so many triangles: testing a few costs no more than another level.
+pub const TRIANGLES_A_LEAF: usize = 4;
+
+/// A leaf holds at most so many instances: to enter one costs more than to test its box.
+pub const INSTANCES_A_LEAF: usize = 1;
 
 /// An item on its way into a leaf.
 #[derive(Clone, Copy)]
@@ -65,22 +70,17 @@ const EMPTY: Bounds32 = Bounds32 { min: [f32::INFINITY; 3], max: [f32::NEG_INFIN
 
 fn grow(b: &mut Bounds32, x: &Bounds32) {
     for k in 0..3 {
-        b.min[k] = b.min[k].min(x.min[k]);
-        b.max[k] = b.max[k].max(x.max[k]);
+        // Finite numbers: one instruction each, unlike `f32::min`.
+        b.min[k] = if x.min[k] < b.min[k] { x.min[k] } else { b.min[k] };
+        b.max[k] = if x.max[k] > b.max[k] { x.max[k] } else { b.max[k] };
     }
 }
 
-/// Half the surface area; in `f64`, where it neither over- nor underflows. 0 for the empty box.
-fn half_area(b: &Bounds32) -> f64 {
-    let [x, y, z] = [0, 1, 2].map(|k| f64::from(b.max[k]) - f64::from(b.min[k]));
-    if x < 0.0 { 0.0 } else { x * y + y * z + z * x }
-}
-
 impl Hierarchy {
-    /// Builds over finite `boxes`; returns the hierarchy and its order: item `i` of the hierarchy
-    /// is `boxes[order[i]]`.
+    /// Builds over finite `boxes`, with at most `leaf_items` in a leaf; returns the hierarchy and its
+    /// order: item `i` of the hierarchy is `boxes[order[i]]`.
     #[must_use]
-    pub fn build(boxes: &[Bounds32]) -> (Self, Vec<u32>) {
+    pub fn build(boxes: &[Bounds32], leaf_items: usize) -> (Self, Vec<u32>) {
         if boxes.is_empty() {
             return (Self::default(), Vec::new());
         }
@@ -97,7 +97,8 @@ impl Hierarchy {
         let deepest_split = 2 * (usize::BITS - boxes.len().leading_zeros()) as usize;
 
         let unknown = Node { bounds: EMPTY, first: 0, count: 0 };
-        let mut out = Self { nodes: Vec::with_capacity(boxes.len()), depth: 0 };
+        let nodes = Vec::with_capacity(boxes.len());
+        let mut out = Self { nodes, ..Self::default() };
         out.nodes.push(unknown);
         // Depth first, left before right: items come out in the order a walk meets them.
         let mut stack = vec![(0usize, 0..items.len(), 1usize)];
@@ -106,7 +107,7 @@ impl Hierarchy {
             let here = &mut items[range.clone()];
             let mut bounds = EMPTY;
             here.iter().for_each(|item| grow(&mut bounds, &item.bounds));
-            if here.len() <= LEAF_ITEMS {
+            if here.len() <= leaf_items {
                 let (first, count) = (range.start as u32, range.len() as u32);
                 out.nodes[node] = Node { bounds, first, count };
                 continue;
@@ -119,6 +120,7 @@ impl Hierarchy {
             stack.push((left + 1, middle..range.end, depth + 1));
             stack.push((left, range.start..middle, depth + 1));
         }
+        out.wide = WideHierarchy::new(&out);
         (out, items.iter().map(|item| item.number).collect())
     }
 
@@ -175,8 +177,8 @@ fn split(items: &mut [Item], scratch: &mut Vec<Item>) -> Option<usize> {
     let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
     for item in items.iter() {
         for k in 0..3 {
-            low[k] = low[k].min(item.center[k]);
-            high[k] = high[k].max(item.center[k]);
+            low[k] = if item.center[k] < low[k] { item.center[k] } else { low[k] };
+            high[k] = if item.center[k] > high[k] { item.center[k] } else { high[k] };
         }
     }
     // Halved before they are subtracted, so that nothing overflows. A scale that does is that of
@@ -199,13 +201,13 @@ fn split(items: &mut [Item], scratch: &mut Vec<Item>) -> Option<usize> {
         for border in (1..BINS).rev() {
             grow(&mut bounds, &bins[border].0);
             count += bins[border].1;
-            right_cost[border] = half_area(&bounds) * f64::from(count);
+            right_cost[border] = bounds.half_area() * f64::from(count);
         }
         let (mut bounds, mut count) = (EMPTY, 0);
         for border in 1..BINS {
             grow(&mut bounds, &bins[border - 1].0);
             count += bins[border - 1].1;
-            let cost = half_area(&bounds) * f64::from(count) + right_cost[border];
+            let cost = bounds.half_area() * f64::from(count) + right_cost[border];
             let splits = count > 0 && (count as usize) < items.len();
             if splits && best.is_none_or(|b| cost < b.0) {
                 best = Some((cost, k, border));
@@ -232,13 +234,16 @@ mod tests {
     use super::*;
 
     fn check(what: &str, boxes: &[Bounds32]) {
-        let (hierarchy, order) = Hierarchy::build(boxes);
-        let ordered: Vec<_> = order.iter().map(|&i| boxes[i as usize]).collect();
-        hierarchy.assert_well_formed(&ordered);
-        let mut all = order.clone();
-        all.sort_unstable();
-        assert!(all.into_iter().eq(0..boxes.len() as u32));
-        assert!(hierarchy.depth <= 64, "{what}: depth {}", hierarchy.depth);
+        for leaf_items in [TRIANGLES_A_LEAF, INSTANCES_A_LEAF] {
+            let (hierarchy, order) = Hierarchy::build(boxes, leaf_items);
+            let ordered: Vec<_> = order.iter().map(|&i| boxes[i as usize]).collect();
+            hierarchy.assert_well_formed(&ordered);
+            let mut all = order.clone();
+            all.sort_unstable();
+            assert!(all.into_iter().eq(0..boxes.len() as u32));
+            assert!(hierarchy.nodes.iter().all(|node| node.count as usize <= leaf_items));
+            assert!(hierarchy.depth <= 64, "{what}: depth {}", hierarchy.depth);
+        }
     }
 
     /// Time is not asserted: were it quadratic, this would run for minutes.

@@ -13,7 +13,10 @@ use std::ops::Range;
 
 use glam::{DAffine3, DVec3};
 
-use crate::{Bounds, Bounds32, Hierarchy, InstanceId, MeshId, ObjectId, PrimitiveId};
+use crate::{
+    Bounds, Bounds32, Hierarchy, InstanceId, MeshId, ObjectId, PrimitiveId,
+    hierarchy::{INSTANCES_A_LEAF, TRIANGLES_A_LEAF},
+};
 
 /// Corners of a triangle in world space, metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,7 +48,7 @@ impl Mesh {
             .iter()
             .map(|t| Bounds32::of_points(t.map(|v| positions[v as usize])))
             .collect();
-        let (hierarchy, order) = Hierarchy::build(&boxes);
+        let (hierarchy, order) = Hierarchy::build(&boxes, TRIANGLES_A_LEAF);
         let bounds = boxes.iter().fold(Bounds::EMPTY, |b, x| b.union(x.widen()));
         let triangles = order.iter().map(|&t| triangles[t as usize]).collect();
         (Self { positions, triangles, hierarchy, bounds }, order)
@@ -177,7 +180,7 @@ impl InstancedGeometry {
                     Bounds32::containing(Bounds { min: b.min - origin, max: b.max - origin })
                 })
                 .collect();
-            let (hierarchy, order) = Hierarchy::build(&relative);
+            let (hierarchy, order) = Hierarchy::build(&relative, INSTANCES_A_LEAF);
             let instances = order.iter().map(|&o| InstanceId(chosen[o as usize] as u32)).collect();
             TopLevel { hierarchy, instances }
         };

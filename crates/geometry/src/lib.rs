@@ -22,6 +22,7 @@ pub mod overlap;
 pub mod raycast;
 mod set;
 mod view;
+mod wide;
 
 pub use bounds::{Bounds, Bounds32};
 pub use frame::{FACE_COUNT, Face, RectifiedFrame, Sampling};

@@ -9,11 +9,12 @@
 //! (JCGT 2013): shear the triangle so that the ray is the z axis, then take the signs of the
 //! three edge functions.
 
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 
 use crate::{
-    Hierarchy, InstanceId, InstancedGeometry, Node, PrimitiveId, TopLevel, UNIT_ROUNDOFF,
+    InstanceId, InstancedGeometry, Mesh, PrimitiveId, TopLevel, UNIT_ROUNDOFF,
     instanced::Placement,
+    wide::{Child, WIDTH, WideHierarchy, WideNode},
 };
 
 /// A half-line `origin + distance * direction`, world space.
@@ -45,11 +46,13 @@ struct Sheared {
     axes: [usize; 3],
     shear: DVec3,
     inverse: [f64; 3],
-    /// True on axes where the direction points down: boxes are entered by their upper side.
-    downward: [bool; 3],
+    /// For each axis, which of a wide node's `bounds` are met first and last: where the direction
+    /// points down, boxes are entered by their upper side.
+    sides: [(usize, usize); 3],
 }
 
 impl Sheared {
+    #[inline(always)]
     fn new(ray: Ray) -> Self {
         let d = ray.direction;
         let kz = if d.x.abs() >= d.y.abs() && d.x.abs() >= d.z.abs() {
@@ -64,14 +67,21 @@ impl Sheared {
             std::mem::swap(&mut kx, &mut ky);
         }
         let shear = DVec3::new(d[kx] / d[kz], d[ky] / d[kz], 1.0 / d[kz]);
-        let inverse = d.recip().to_array();
-        let downward = inverse.map(|i| i < 0.0);
-        Self { origin: ray.origin.to_array(), axes: [kx, ky, kz], shear, inverse, downward }
+        let inverse = [1.0 / d.x, 1.0 / d.y, 1.0 / d.z];
+        let side = |k: usize| if inverse[k] < 0.0 { (k + 3, k) } else { (k, k + 3) };
+        let sides = [side(0), side(1), side(2)];
+        Self { origin: ray.origin.to_array(), axes: [kx, ky, kz], shear, inverse, sides }
+    }
+
+    /// The ray of the same direction from another origin.
+    #[inline(always)]
+    fn from(&self, origin: DVec3) -> Self {
+        Self { origin: origin.to_array(), ..*self }
     }
 
     /// A corner in the ray's sheared space, relative to its origin.
     #[inline(always)]
-    fn sheared(&self, corner: [f32; 3]) -> (f64, f64, f64) {
+    fn sheared(&self, corner: &[f32; 3]) -> (f64, f64, f64) {
         let [kx, ky, kz] = self.axes;
         let z = f64::from(corner[kz]) - self.origin[kz];
         let x = (f64::from(corner[kx]) - self.origin[kx]) - self.shear.x * z;
@@ -79,11 +89,12 @@ impl Sheared {
         (x, y, z)
     }
 
-    /// Distance to the triangle and the sign of its determinant (> 0: front), if hit.
+    /// Distance to triangle `t` and the sign of its determinant (> 0: front), if hit.
     #[inline(always)]
-    fn triangle(&self, corners: [[f32; 3]; 3]) -> Option<(f64, bool)> {
-        let [a, b, c] = corners;
-        let p = [self.sheared(a), self.sheared(b), self.sheared(c)];
+    fn triangle(&self, mesh: &Mesh, t: usize) -> Option<(f64, bool)> {
+        let [a, b, c] = mesh.triangles[t];
+        let corner = |v: u32| self.sheared(&mesh.positions[v as usize]);
+        let p = [corner(a), corner(b), corner(c)];
         let u = p[2].0 * p[1].1 - p[2].1 * p[1].0;
         let v = p[0].0 * p[2].1 - p[0].1 * p[2].0;
         let w = p[1].0 * p[0].1 - p[1].1 * p[0].0;
@@ -98,68 +109,85 @@ impl Sheared {
         (t > 0.0).then_some((t, det > 0.0))
     }
 
-    /// Entry distance into a node's box, if the box is met within `limit`.
+    /// Distances at which the boxes of a node's children are entered and left within `limit`. A
+    /// box is met where the first is not larger than the second.
     #[inline(always)]
-    fn node(&self, node: &Node, limit: f64) -> Option<f64> {
+    fn boxes(&self, node: &WideNode, limit: f64) -> ([f64; WIDTH], [f64; WIDTH]) {
         // Two roundings of (b - o) * inverse, doubled: the far side is moved out by it, after
         // Ize, "Robust BVH Ray Traversal" (JCGT 2013).
         const SLACK: f64 = 1.0 + 8.0 * UNIT_ROUNDOFF;
-        let (mut near, mut far) = (0.0_f64, limit);
-        let (min, max) = (&node.bounds.min, &node.bounds.max);
+        let (mut near, mut far) = ([0.0_f64; WIDTH], [limit; WIDTH]);
         for k in 0..3 {
-            let (enter, leave) = if self.downward[k] { (max[k], min[k]) } else { (min[k], max[k]) };
-            let enter = (f64::from(enter) - self.origin[k]) * self.inverse[k];
-            let leave = (f64::from(leave) - self.origin[k]) * self.inverse[k] * SLACK;
-            // The NaN of 0 * inf compares false and is dropped: the ray lies in the slab's border.
-            near = if enter > near { enter } else { near };
-            far = if leave < far { leave } else { far };
+            let (enter, leave) = self.sides[k];
+            let (enter, leave) = (&node.bounds[enter], &node.bounds[leave]);
+            for c in 0..WIDTH {
+                let enter = (f64::from(enter[c]) - self.origin[k]) * self.inverse[k];
+                let leave = (f64::from(leave[c]) - self.origin[k]) * self.inverse[k] * SLACK;
+                // The NaN of 0 * inf compares false and is dropped: the ray lies in the slab's
+                // border.
+                near[c] = if enter > near[c] { enter } else { near[c] };
+                far[c] = if leave < far[c] { leave } else { far[c] };
+            }
         }
-        (near <= far).then_some(near)
+        (near, far)
     }
 }
 
-/// Walks a hierarchy front to back; `leaf(items, limit)` returns the new limit.
-fn walk(
-    hierarchy: &Hierarchy,
+/// A place of a hierarchy that is still to be visited, and the distance at which it is entered.
+type Open = (f64, Child);
+
+/// The bits of a child's place.
+const PLACE: u64 = WIDTH as u64 - 1;
+
+/// Walks a hierarchy front to back: the items of the next leaf that a ray meets within `limit`.
+/// `stack` holds the [`root`] at first, and nothing at the end.
+#[inline(always)]
+fn next_leaf(
+    hierarchy: &WideHierarchy,
     ray: &Sheared,
     limit: f64,
-    stack: &mut Vec<(f64, u32)>,
-    mut leaf: impl FnMut(std::ops::Range<usize>, f64) -> f64,
-) -> f64 {
-    let nodes = &hierarchy.nodes;
-    let mut limit = limit;
-    let base = stack.len();
-    if let Some(near) = nodes.first().and_then(|n| ray.node(n, limit)) {
-        stack.push((near, 0));
-    }
-    while stack.len() > base {
-        let Some((near, index)) = stack.pop() else { break };
+    stack: &mut Vec<Open>,
+) -> Option<std::ops::Range<usize>> {
+    while let Some((near, child)) = stack.pop() {
         if near > limit {
             continue;
         }
-        let node = &nodes[index as usize];
-        let first = node.first as usize;
-        if node.is_leaf() {
-            limit = leaf(first..first + node.count as usize, limit);
-            continue;
+        let first = child.first as usize;
+        if child.count > 0 {
+            return Some(first..first + child.count as usize);
         }
-        let left = ray.node(&nodes[first], limit).map(|n| (n, first as u32));
-        let right = ray.node(&nodes[first + 1], limit).map(|n| (n, first as u32 + 1));
-        match (left, right) {
-            (Some(l), Some(r)) if l.0 <= r.0 => stack.extend([r, l]),
-            (Some(l), Some(r)) => stack.extend([l, r]),
-            (Some(one), None) | (None, Some(one)) => stack.push(one),
-            (None, None) => {}
+        let node = &hierarchy.nodes[first];
+        let (near, far) = ray.boxes(node, limit);
+        // Entry distance and place in one number. Distances are not negative, so their bits are
+        // in their order; two bits less make them smaller, which is on the safe side.
+        let mut keys: [u64; WIDTH] = std::array::from_fn(|place| {
+            let key = near[place].to_bits() & !PLACE | place as u64;
+            if near[place] <= far[place] { key } else { u64::MAX }
+        });
+        for (a, b) in [(0, 1), (2, 3), (0, 2), (1, 3), (1, 2)] {
+            (keys[a], keys[b]) = (keys[a].min(keys[b]), keys[a].max(keys[b]));
+        }
+        // Nearest on top.
+        for key in keys.into_iter().rev() {
+            if key != u64::MAX {
+                stack.push((f64::from_bits(key & !PLACE), node.children[(key & PLACE) as usize]));
+            }
         }
     }
-    limit
+    None
+}
+
+/// Where the walk of a hierarchy begins, if it has nodes.
+#[inline(always)]
+fn root(hierarchy: &WideHierarchy) -> Option<Open> {
+    (!hierarchy.nodes.is_empty()).then_some((0.0, Child { first: 0, count: 0 }))
 }
 
 /// Scratch memory of a caster; keep one a thread.
 #[derive(Default)]
 pub struct RayCaster {
-    top: Vec<(f64, u32)>,
-    bottom: Vec<(f64, u32)>,
+    top: Vec<Open>,
+    bottom: Vec<Open>,
 }
 
 impl RayCaster {
@@ -180,34 +208,75 @@ impl RayCaster {
         accept: &mut impl FnMut(PrimitiveId) -> bool,
         visit: &mut impl FnMut(Hit, f64) -> f64,
     ) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // Sound: the processor has what the function was compiled for.
+            #[allow(unsafe_code)]
+            return unsafe {
+                self.visit_with_avx2(geometry, top_level, ray, limit, accept, visit);
+            };
+        }
+        self.visit_anywhere(geometry, top_level, ray, limit, accept, visit);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
+    fn visit_with_avx2(
+        &mut self,
+        geometry: &InstancedGeometry,
+        top_level: &TopLevel,
+        ray: Ray,
+        limit: f64,
+        accept: &mut impl FnMut(PrimitiveId) -> bool,
+        visit: &mut impl FnMut(Hit, f64) -> f64,
+    ) {
+        self.visit_anywhere(geometry, top_level, ray, limit, accept, visit);
+    }
+
+    #[inline(always)]
+    fn visit_anywhere(
+        &mut self,
+        geometry: &InstancedGeometry,
+        top_level: &TopLevel,
+        ray: Ray,
+        limit: f64,
+        accept: &mut impl FnMut(PrimitiveId) -> bool,
+        visit: &mut impl FnMut(Hit, f64) -> f64,
+    ) {
         let relative = Sheared::new(Ray { origin: ray.origin - geometry.origin, ..ray });
         let Self { top, bottom } = self;
-        walk(&top_level.hierarchy, &relative, limit, top, |items, mut limit| {
+        let mut limit = limit;
+        top.clear();
+        top.extend(root(&top_level.hierarchy.wide));
+        while let Some(items) = next_leaf(&top_level.hierarchy.wide, &relative, limit, top) {
             for &id in &top_level.instances[items] {
                 let instance = &geometry.instances[id.index()];
                 let mesh = &geometry.meshes[instance.mesh.index()];
+                let wide = &mesh.hierarchy.wide;
                 // The affine inverse keeps distances: they are in units of the direction.
                 let Placement { mesh_from_world } = geometry.placement(id);
-                let local = Sheared::new(Ray {
-                    origin: mesh_from_world.transform_point3(ray.origin),
-                    direction: mesh_from_world.transform_vector3(ray.direction),
-                });
-                limit = walk(&mesh.hierarchy, &local, limit, bottom, |items, mut limit| {
+                let local = if mesh_from_world.matrix3 == DMat3::IDENTITY {
+                    relative.from(ray.origin + mesh_from_world.translation)
+                } else {
+                    Sheared::new(Ray {
+                        origin: mesh_from_world.transform_point3(ray.origin),
+                        direction: mesh_from_world.transform_vector3(ray.direction),
+                    })
+                };
+                bottom.clear();
+                bottom.extend(root(wide));
+                while let Some(items) = next_leaf(wide, &local, limit, bottom) {
                     for t in items {
-                        let Some((distance, front)) = local.triangle(mesh.stored_corners(t)) else {
-                            continue;
-                        };
+                        let Some((distance, front)) = local.triangle(mesh, t) else { continue };
                         let primitive = PrimitiveId(instance.first_primitive.0 + t as u32);
                         if distance <= limit && accept(primitive) {
                             let hit = Hit { distance, primitive, instance: id, front };
                             limit = visit(hit, limit);
                         }
                     }
-                    limit
-                });
+                }
             }
-            limit
-        });
+        }
     }
 
     /// The nearest occluder within `limit` among the accepted primitives; of equally near
@@ -258,7 +327,7 @@ impl RayCaster {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Instance, Mesh, MeshId, ObjectId};
+    use crate::{Instance, MeshId, ObjectId};
     use glam::DAffine3;
 
     fn square(at: f32, first: u32, occluder: bool) -> (Mesh, Instance) {
@@ -317,5 +386,92 @@ mod tests {
                 assert_eq!(hit.map(|h| h.distance), Some(2.0), "{x} {y}");
             }
         }
+    }
+
+    /// A number in [-1, 1) that looks random.
+    fn scatter(i: u64) -> f64 {
+        let mixed = (i + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        (mixed >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+    }
+
+    /// Meshes of small triangles all over the place, under translations, rotations and mirrors.
+    fn clutter() -> InstancedGeometry {
+        let mut meshes = vec![];
+        let mut instances = vec![];
+        let mut first = 0;
+        for m in 0..12u64 {
+            let corner = |v: u64, axis: u64| scatter(1000 * m + 3 * (v / 3) + axis) as f32;
+            let nudge = |v: u64, axis: u64| 0.2 * scatter(50_000 + 700 * m + 3 * v + axis) as f32;
+            let count = 7 * m + 1;
+            let positions: Vec<[f32; 3]> = (0..3 * count)
+                .map(|v| [0, 1, 2].map(|axis| corner(v, axis) + nudge(v, axis)))
+                .collect();
+            let triangles: Vec<[u32; 3]> =
+                (0..count as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
+            meshes.push(Mesh::new(positions, &triangles).0);
+            let to = DVec3::new(scatter(m), scatter(m + 90), scatter(m + 180));
+            let turned = DAffine3::from_axis_angle(to.normalize(), m as f64);
+            let mirrored = DAffine3::from_scale(DVec3::new(-1.0, 1.0, 2.0));
+            let moved = DAffine3::from_translation(to);
+            for world_from_mesh in [moved, moved * turned, moved * turned * mirrored] {
+                instances.push(Instance {
+                    mesh: MeshId(m as u32),
+                    object: ObjectId(0),
+                    world_from_mesh,
+                    first_primitive: PrimitiveId(first),
+                    occluder: true,
+                });
+                first += count as u32;
+            }
+        }
+        InstancedGeometry::new(meshes, instances)
+    }
+
+    /// The nearest hit as `closest_occluder` defines it, found without a hierarchy.
+    fn nearest_of_all(geometry: &InstancedGeometry, ray: Ray) -> Option<(f64, PrimitiveId)> {
+        let mut hits = vec![];
+        for (id, instance) in (0..).map(InstanceId).zip(&geometry.instances) {
+            let Placement { mesh_from_world } = geometry.placement(id);
+            let local = Sheared::new(Ray {
+                origin: mesh_from_world.transform_point3(ray.origin),
+                direction: mesh_from_world.transform_vector3(ray.direction),
+            });
+            let mesh = &geometry.meshes[instance.mesh.index()];
+            for t in 0..mesh.triangles.len() {
+                let primitive = PrimitiveId(instance.first_primitive.0 + t as u32);
+                hits.extend(local.triangle(mesh, t).map(|(distance, _)| (distance, primitive)));
+            }
+        }
+        hits.into_iter().min_by(|a, b| a.partial_cmp(b).expect("distances are numbers"))
+    }
+
+    #[test]
+    fn walks_find_what_is_nearest_of_all_on_any_processor() {
+        let geometry = clutter();
+        let mut caster = RayCaster::new();
+        let mut hits = 0;
+        for i in 0..3000 {
+            let [x, y, z, u, v, w] = [0, 1, 2, 3, 4, 5].map(|k| scatter(7 * i + k + 1_000_000));
+            let ray = Ray { origin: DVec3::new(x, y, z), direction: DVec3::new(u, v, w) };
+            let expected = nearest_of_all(&geometry, ray);
+            let found = caster.closest_occluder(&geometry, ray, f64::INFINITY, |_| true);
+            assert_eq!(found.map(|hit| (hit.distance, hit.primitive)), expected, "{ray:?}");
+            let mut nearest: Option<(f64, PrimitiveId)> = None;
+            caster.visit_anywhere(
+                &geometry,
+                &geometry.occluders,
+                ray,
+                f64::INFINITY,
+                &mut |_| true,
+                &mut |hit, limit| {
+                    let this = (hit.distance, hit.primitive);
+                    nearest = Some(nearest.map_or(this, |n| if this < n { this } else { n }));
+                    limit.min(hit.distance)
+                },
+            );
+            assert_eq!(nearest, expected, "{ray:?}");
+            hits += usize::from(expected.is_some());
+        }
+        assert!(hits > 1000 && hits < 3000, "{hits}: some rays hit, some do not");
     }
 }

@@ -133,7 +133,7 @@ impl Default for RegionConfig {
 
 impl Default for SolverConfig {
     fn default() -> Self {
-        Self { rows: 32, rows_max: 512, rings: 1, verticals: false }
+        Self { rows: 24, rows_max: 512, rings: 1, verticals: false }
     }
 }
 
@@ -231,7 +231,7 @@ pub const KEYS: &[KeyDoc] = &[
     key(
         "solver.rows",
         "integer",
-        "32",
+        "24",
         "rows a face",
         "Rows of a face of the image, for the segments that cells share; a face has as many \
          columns. Cells that need more get it by refinement; without refinement, more rows find \
@@ -509,7 +509,7 @@ impl SolverConfig {
             "solver.rows",
             &self.rows,
             "is out of range",
-            "use 2 to 16384 rows; 32 suit most scenes, 100 to 400 where nothing is refined",
+            "use 2 to 16384 rows; 24 suit most scenes, 100 to 400 where nothing is refined",
         )?;
         require(
             (self.rows..=ROWS_MAX).contains(&self.rows_max),

@@ -111,7 +111,7 @@ mod tests {
             [
                 "region.cell_size changed from 10.0 to 5.0",
                 "region.ground_from changed from absent to 2.0",
-                "solver.rows changed from 32 to 104",
+                "solver.rows changed from 24 to 104",
             ]
         );
         assert!(changed_keys(&old, &old).is_empty());
