@@ -117,13 +117,11 @@ impl Line {
         least(largest(z, self.near), self.far)
     }
 
-    /// Between which depths the line is on `s..e`, errors included.
+    /// No depth on `s..e` is larger than this, errors included.
     #[inline(always)]
-    fn depths(&self, s: f64, e: f64) -> Depths {
-        let (zs, ze) = (self.depth(s), self.depth(e));
-        let (near, far) = (least(zs, ze), largest(zs, ze));
-        let error = self.error + 4.0 * UNIT_ROUNDOFF * far;
-        Depths { near: near - error, far: far + error }
+    fn farthest(&self, s: f64, e: f64) -> f64 {
+        let far = largest(self.depth(s), self.depth(e));
+        far + self.error + 4.0 * UNIT_ROUNDOFF * far
     }
 }
 
@@ -164,34 +162,14 @@ fn decide(new: &Line, old: &Line, s: f64, e: f64, tie: bool) -> Nearer {
     if at_s < 0 { Nearer::NewThenOld(t) } else { Nearer::OldThenNew(t) }
 }
 
-/// Bounds on the depths of a line on a stretch, errors included. Of two that do not overlap, the
-/// nearer one is nearer by more than [`compare`] takes for equal.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Depths {
-    near: f64,
-    far: f64,
-}
-
 /// A half-open stretch `t0 <= t < t1` of a bin on which a line is nearest.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Piece {
     t0: f64,
     t1: f64,
-    depths: Depths,
+    /// No depth of the piece is larger.
+    far: f64,
     line: u32,
-}
-
-/// Decides between two pieces' lines on `s..e`.
-#[inline(always)]
-fn decide_pieces(lines: &[Line], new: &Piece, old: &Piece, s: f64, e: f64) -> Nearer {
-    if new.depths.near > old.depths.far {
-        Nearer::Old
-    } else if new.depths.far < old.depths.near {
-        Nearer::New
-    } else {
-        let (new, old) = (&lines[new.line as usize], &lines[old.line as usize]);
-        decide(new, old, s, e, new.primitive < old.primitive)
-    }
 }
 
 /// Where the pieces of a bin are.
@@ -214,30 +192,17 @@ pub struct Envelopes {
     scratch: Vec<Piece>,
 }
 
-/// The bin that holds `t`, which is in [0, 1]; for a border of two bins, either of them.
+/// The bin that holds `t`, which is in [0, 1].
 #[inline(always)]
 #[must_use]
 pub fn bin_of(t: f64) -> usize {
-    // Added to it, a number below 2^51 is rounded to an integer, which is in the lowest bits: one
-    // instruction, where a cast takes ten.
-    const TO_INTEGER: f64 = 1.5 * (1u64 << 52) as f64;
-    let rounded = (t * BINS as f64 - 0.5) + TO_INTEGER;
-    (rounded.to_bits() as usize & (2 * BINS - 1)).min(BINS - 1)
+    ((t * BINS as f64) as usize).min(BINS - 1)
 }
 
 /// The stretch of t of a bin; exact, as `BINS` is a power of two.
 #[inline(always)]
 fn stretch(bin: usize) -> (f64, f64) {
-    const BORDERS: [f64; BINS + 1] = {
-        let mut borders = [0.0; BINS + 1];
-        let mut bin = 0;
-        while bin <= BINS {
-            borders[bin] = bin as f64 / BINS as f64;
-            bin += 1;
-        }
-        borders
-    };
-    (BORDERS[bin], BORDERS[bin + 1])
+    (bin as f64 / BINS as f64, (bin + 1) as f64 / BINS as f64)
 }
 
 /// Appends a piece; joins it to the last one if that is the same line.
@@ -246,19 +211,18 @@ fn push(out: &mut Vec<Piece>, lines: &[Line], t0: f64, t1: f64, line: u32) {
     if t0 >= t1 {
         return;
     }
-    let depths = lines[line as usize].depths(t0, t1);
+    let far = lines[line as usize].farthest(t0, t1);
     match out.last_mut() {
         Some(last) if last.line == line && last.t1 == t0 => {
             last.t1 = t1;
-            last.depths.near = least(last.depths.near, depths.near);
-            last.depths.far = largest(last.depths.far, depths.far);
+            last.far = largest(last.far, far);
         }
-        _ => out.push(Piece { t0, t1, depths, line }),
+        _ => out.push(Piece { t0, t1, far, line }),
     }
 }
 
 impl Envelopes {
-    /// Empties the lists and makes room for `pixels`, which are numbered row by row.
+    /// Empties the lists and makes room for `pixels`.
     pub fn clear(&mut self, pixels: usize) {
         let bins = pixels * BINS;
         self.lines.clear();
@@ -288,14 +252,12 @@ impl Envelopes {
         let number = self.lines.len() as u32;
         self.lines.push(line);
         let mut won = false;
+        let near = line.near - line.error;
         for bin in bin_of(a)..=bin_of(b) {
             let (start, end) = stretch(bin);
-            let (t0, t1) = (largest(a, start), least(b, end));
-            if t0 < t1 {
-                let piece = Piece { t0, t1, depths: line.depths(t0, t1), line: number };
-                if piece.depths.near <= self.far[pixel][bin] {
-                    won |= self.insert_into_bin(pixel, bin, piece);
-                }
+            let (s, e) = (largest(a, start), least(b, end));
+            if s < e && near <= self.far[pixel][bin] {
+                won |= self.insert_into_bin(pixel, bin, number, s, e);
             }
         }
         if !won {
@@ -305,22 +267,17 @@ impl Envelopes {
     }
 
     #[inline(always)]
-    fn insert_into_bin(&mut self, pixel: usize, bin: usize, new: Piece) -> bool {
+    fn insert_into_bin(&mut self, pixel: usize, bin: usize, new: u32, a: f64, b: f64) -> bool {
         let slot = pixel * BINS + bin;
         let Bin { first, len, .. } = self.bins[slot];
         let (first, len) = (first as usize, len as usize);
         let lines = &self.lines[..];
+        let new_line = &lines[new as usize];
         let old = &self.pieces[first..first + len];
-        let Piece { t0: a, t1: b, .. } = new;
-        let before = old.iter().take_while(|piece| piece.t1 <= a).count();
-        let Some(met) = old.get(before).filter(|piece| piece.t0 < b) else {
-            // Most often nothing is there yet.
-            self.put(slot, before, new);
-            self.update_far(pixel, bin);
-            return true;
-        };
-        if met.t0 <= a && b <= met.t1 && decide_pieces(lines, &new, met, a, b) == Nearer::Old {
-            return false;
+
+        let mut before = 0;
+        while before < len && old[before].t1 <= a {
+            before += 1;
         }
         let scratch = &mut self.scratch;
         scratch.clear();
@@ -330,11 +287,13 @@ impl Envelopes {
         while behind < len && old[behind].t0 < b {
             let piece = old[behind];
             if cursor < piece.t0 {
-                push(scratch, lines, cursor, piece.t0, new.line);
+                push(scratch, lines, cursor, piece.t0, new);
                 won = true;
             }
             let (s, e) = (largest(piece.t0, a), least(piece.t1, b));
-            let nearer = decide_pieces(lines, &new, &piece, s, e);
+            let old_line = &lines[piece.line as usize];
+            let tie = new_line.primitive < old_line.primitive;
+            let nearer = decide(new_line, old_line, s, e, tie);
             if nearer == Nearer::Old {
                 scratch.push(piece);
             } else {
@@ -342,14 +301,14 @@ impl Envelopes {
                 push(scratch, lines, piece.t0, s, piece.line);
                 match nearer {
                     Nearer::NewThenOld(t) => {
-                        push(scratch, lines, s, t, new.line);
+                        push(scratch, lines, s, t, new);
                         push(scratch, lines, t, e, piece.line);
                     }
                     Nearer::OldThenNew(t) => {
                         push(scratch, lines, s, t, piece.line);
-                        push(scratch, lines, t, e, new.line);
+                        push(scratch, lines, t, e, new);
                     }
-                    _ => push(scratch, lines, s, e, new.line),
+                    _ => push(scratch, lines, s, e, new),
                 }
                 push(scratch, lines, e, piece.t1, piece.line);
             }
@@ -357,30 +316,15 @@ impl Envelopes {
             behind += 1;
         }
         if cursor < b {
-            push(scratch, lines, cursor, b, new.line);
+            push(scratch, lines, cursor, b, new);
             won = true;
         }
         if won {
             self.replace(slot, before, behind);
-            self.update_far(pixel, bin);
+            let (start, end) = stretch(bin);
+            self.far[pixel][bin] = self.farthest(slot, start, end);
         }
         won
-    }
-
-    /// Puts one piece before piece `at` of a bin.
-    #[inline(always)]
-    fn put(&mut self, slot: usize, at: usize, piece: Piece) {
-        let Bin { first, len, capacity } = self.bins[slot];
-        let (first, len) = (first as usize, len as usize);
-        if len < capacity as usize {
-            self.pieces.copy_within(first + at..first + len, first + at + 1);
-            self.pieces[first + at] = piece;
-            self.bins[slot].len += 1;
-        } else {
-            self.scratch.clear();
-            self.scratch.push(piece);
-            self.replace(slot, at, at);
-        }
     }
 
     /// Puts the scratch pieces in the place of `before..behind` of a bin.
@@ -405,30 +349,19 @@ impl Envelopes {
         self.bins[slot].len = new_len as u32;
     }
 
-    #[inline(always)]
-    fn update_far(&mut self, pixel: usize, bin: usize) {
-        self.far[pixel][bin] = self.farthest(pixel * BINS + bin, stretch(bin));
-    }
-
     /// The far depth of a bin.
     #[inline(always)]
-    fn farthest(&self, slot: usize, (start, end): (f64, f64)) -> f64 {
-        let pieces = self.of(slot);
-        if pieces.first().is_none_or(|first| first.t0 > start)
-            || pieces.last().is_none_or(|last| last.t1 < end)
-        {
-            return f64::INFINITY;
-        }
+    fn farthest(&self, slot: usize, start: f64, end: f64) -> f64 {
         let mut covered = start;
         let mut far = f64::NEG_INFINITY;
-        for piece in pieces {
+        for piece in self.of(slot) {
             if piece.t0 > covered {
                 return f64::INFINITY;
             }
-            far = largest(far, piece.depths.far);
+            far = largest(far, piece.far);
             covered = piece.t1;
         }
-        far
+        if covered >= end { far } else { f64::INFINITY }
     }
 
     #[inline(always)]
@@ -488,8 +421,7 @@ impl Envelopes {
             assert!(bin.len <= bin.capacity);
             for p in list {
                 assert!(start <= p.t0 && p.t0 < p.t1 && p.t1 <= end, "{p:?} lies in its bin");
-                let far = self.far[slot / BINS][slot % BINS];
-                assert!(p.depths.far <= far, "{p:?} is not beyond far");
+                assert!(p.far <= self.far[slot / BINS][slot % BINS], "{p:?} is not beyond far");
             }
             assert!(list.windows(2).all(|w| w[0].t1 <= w[1].t0), "sorted, disjoint: {list:?}");
         }

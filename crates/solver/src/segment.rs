@@ -291,12 +291,9 @@ fn solid_angles(
             corners[i * WIDTH + j] = Sampling::solid_angle(0.0, c, 0.0, w);
         }
     }
-    let mut angles = [0.0; TILE_ROWS * TILE_COLUMNS];
-    for (pixel, angle) in angles.iter_mut().enumerate() {
+    std::array::from_fn(|pixel| {
         let at = pixel / TILE_COLUMNS * WIDTH + pixel % TILE_COLUMNS;
-        let below = corners[at + 1] - corners[at];
-        let above = corners[at + WIDTH + 1] - corners[at + WIDTH];
-        *angle = (above - below) / whole;
-    }
-    angles
+        let [a, b, c, d] = [at, at + 1, at + WIDTH, at + WIDTH + 1].map(|k| corners[k]);
+        ((d - c) - (b - a)) / whole
+    })
 }

@@ -302,8 +302,8 @@ impl TileSolver {
         space: u32,
         node: u32,
     ) -> Option<Entry> {
-        let scale = 1.0 / context.frame.length;
-        let bin = |x: f64| bin_of(least(largest(x * scale, 0.0), 1.0)) as u8;
+        let scale = BINS as f64 / context.frame.length;
+        let bin = |x: f64| ((x * scale) as usize).min(BINS - 1) as u8;
         let entry = Entry { near, first_bin: bin(first), last_bin: bin(last), space, node };
         (!self.is_hidden(&entry)).then_some(entry)
     }
@@ -462,14 +462,10 @@ impl TileSolver {
                 last[k] = largest(last[k], t);
             }
         }
-        let mut bins = [const { 0..0 }; TILE_COLUMNS];
-        for k in 0..TILE_COLUMNS {
+        std::array::from_fn(|k| {
             let (first, last) = (first[k] - slack[k], last[k] + slack[k]);
-            if last >= 0.0 && first <= 1.0 {
-                bins[k] = bin_of(largest(first, 0.0))..bin_of(least(last, 1.0)) + 1;
-            }
-        }
-        bins
+            if last < 0.0 || first > 1.0 { 0..0 } else { bin_of(first)..bin_of(last) + 1 }
+        })
     }
 
     #[inline(always)]
