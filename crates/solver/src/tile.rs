@@ -9,13 +9,22 @@
 //! ```
 //!
 //! so one pass over a node's box gives whether the beam meets it, the stretch of t on which it
-//! can be seen, and its nearest depth. The pixels' lists are kept by bins of t, each with the
+//! can be seen, and its nearest depth *inside the beam*: what lies aside of the axis enters the beam
+//! only where the beam is wide enough,
+//!
+//! ```text
+//! z >= y / w_hi    z >= y / w_lo    z >= (x - L) / c_hi    z >= x / c_lo
+//! ```
+//!
+//! where the divisor has the sign of what is divided. The pixels' lists are kept by bins of t, each with the
 //! farthest depth of what covers it wholly (infinite where something shows through): see
 //! [`envelope`](crate::envelope). Above them are the farthest over the pixels of a row, and over
 //! the rows of the tile. A node is skipped when it is behind all bins that it can touch.
 //!
 //! Invariant: skipping never changes the result. Boxes and bins are compared with slack for the
 //! rounding of either side, so what is skipped is behind by more than the error bound.
+
+use std::cmp::Ordering;
 
 use glam::{DMat3, DVec3};
 use sightline_geometry::{
@@ -52,18 +61,67 @@ struct Space {
     face_from_local: DMat3,
     offset: DVec3,
     instance: InstanceId,
-    normal: [DVec3; 6],
-    extent: [DVec3; 6],
-    constant: [f64; 6],
+    normal: [DVec3; 7],
+    extent: [DVec3; 7],
+    constant: [f64; 7],
+}
+
+/// How far something has to be to be inside a tile's beam.
+///
+/// The divisors of the bounds are kept as their inverses, 0 for a side on which there is no bound: the
+/// result is then 0, which all depths are at least.
+#[derive(Clone, Copy, Debug, Default)]
+struct Wedge {
+    length: f64,
+    /// Inverse of the largest and of the least c, with its sign turned.
+    columns: [f64; 2],
+    /// Inverse of the largest and of the least w, with its sign turned.
+    rows: [f64; 2],
+}
+
+impl Wedge {
+    fn new(length: f64, rows: (f64, f64), columns: (f64, f64)) -> Self {
+        let inverse = |wide: f64| if wide > 0.0 { 1.0 / wide } else { 0.0 };
+        Self {
+            length,
+            columns: [inverse(columns.1), inverse(-columns.0)],
+            rows: [inverse(rows.1), inverse(-rows.0)],
+        }
+    }
+
+    /// No point of the beam with these x and y (least, largest) has a lesser z.
+    #[inline(always)]
+    fn nearest(&self, x: (f64, f64), y: (f64, f64)) -> f64 {
+        let by_columns = largest((x.0 - self.length) * self.columns[0], -x.1 * self.columns[1]);
+        let by_rows = largest(y.0 * self.rows[0], -y.1 * self.rows[1]);
+        largest(by_columns, by_rows)
+    }
 }
 
 #[derive(Clone, Copy)]
 struct Entry {
+    /// No depth inside the beam is less.
     near: f64,
+    /// Depth of the nearest corner, inside the beam or not.
+    corner: f64,
     first_bin: u8,
     last_bin: u8,
     space: u32,
     node: u32,
+}
+
+impl Entry {
+    /// What is entered first comes first. Of equals, such as parts of one wall or all that the
+    /// camera stands in, what reaches farthest back: the largest hides most.
+    #[inline(always)]
+    fn order(&self, other: &Self) -> Ordering {
+        self.near.total_cmp(&other.near).then(self.corner.total_cmp(&other.corner))
+    }
+
+    #[inline(always)]
+    fn comes_before(&self, other: &Self) -> bool {
+        self.near < other.near || (self.near == other.near && self.corner < other.corner)
+    }
 }
 
 /// Counters of a solve; sums over tiles.
@@ -129,6 +187,7 @@ impl Far {
 pub struct TileSolver {
     rows: Vec<f64>,
     columns: Vec<Column>,
+    wedge: Wedge,
     envelopes: Envelopes,
     row_far: Vec<Far>,
     tile_far: Far,
@@ -188,6 +247,8 @@ impl TileSolver {
         self.rows.extend_from_slice(w);
         self.columns.clear();
         self.columns.extend_from_slice(c);
+        let ends = (w[0], w[w.len() - 1]);
+        self.wedge = Wedge::new(context.frame.length, ends, (c[0].c, c[TILE_COLUMNS - 1].c));
         self.envelopes.clear(pixels);
         self.row_far.clear();
         self.row_far.resize(w.len(), Far::default());
@@ -229,7 +290,7 @@ impl TileSolver {
         let (x, y, z) = (rows.x_axis, rows.y_axis, rows.z_axis);
         let (w_lo, w_hi) = (self.rows[0], self.rows[self.rows.len() - 1]);
         let (c_lo, c_hi) = (self.columns[0].c, self.columns[self.columns.len() - 1].c);
-        let normal = [y - w_lo * z, w_hi * z - y, x - c_lo * z, x - c_hi * z, z, y];
+        let normal = [y - w_lo * z, w_hi * z - y, x - c_lo * z, x - c_hi * z, z, y, x];
         let constant = [
             offset.y - w_lo * offset.z,
             w_hi * offset.z - offset.y,
@@ -237,6 +298,7 @@ impl TileSolver {
             offset.x - c_hi * offset.z,
             offset.z,
             offset.y,
+            offset.x,
         ];
         // Rounding of a box test and of the vertices in the box: `depth` each, scaled by |c|.
         let slack = |c: f64| 2.0 * context.bounds.depth * (1.0 + c.abs());
@@ -247,6 +309,7 @@ impl TileSolver {
             constant[3] - slack(c_hi),
             constant[4],
             constant[5],
+            constant[6],
         ];
         let extent = normal.map(DVec3::abs);
         Space { face_from_local, offset, instance, normal, extent, constant }
@@ -270,24 +333,28 @@ impl TileSolver {
         if z + dz < -slack {
             return None;
         }
-        let zn = z - dz - slack;
-        if zn > 0.0 {
-            let (y, dy) = (middle(5), reach(5));
+        let (first, last) = (middle(3) - reach(3), middle(2) + reach(2));
+        // `first > last` only behind the camera: no ray of the beam gets there.
+        if last < 0.0 || first > context.frame.length || first > last {
+            return None;
+        }
+        let (x, dx) = (middle(6), reach(6));
+        let (y, dy) = (middle(5), reach(5));
+        let near = largest(z - dz, self.wedge.nearest((x - dx, x + dx), (y - dy, y + dy))) - slack;
+        if near > z + dz + slack {
+            return None;
+        }
+        if near > 0.0 {
             let (lo, hi) = (y - dy - slack, y + dy + slack);
-            let (a, b) = (1.0 / zn, 1.0 / (z + dz + slack));
+            let (a, b) = (1.0 / near, 1.0 / (z + dz + slack));
             let lo = if lo < 0.0 { lo * a } else { lo * b };
             let hi = if hi < 0.0 { hi * b } else { hi * a };
             if rows_met(&self.rows, (lo, hi)).is_empty() {
                 return None;
             }
         }
-        let (first, last) = (middle(3) - reach(3), middle(2) + reach(2));
-        // `first > last` only behind the camera: no ray of the beam gets there.
-        if last < 0.0 || first > context.frame.length || first > last {
-            return None;
-        }
-        let near = z - dz - slack;
-        self.entry_if_not_hidden(context, near, first, last, space, node)
+        let entry = self.entry_if_not_hidden(context, near, first, last, space, node)?;
+        Some(Entry { corner: z - dz, ..entry })
     }
 
     /// An entry for something no nearer than `near` that covers at most `first..last` along the
@@ -304,7 +371,8 @@ impl TileSolver {
     ) -> Option<Entry> {
         let scale = BINS as f64 / context.frame.length;
         let bin = |x: f64| ((x * scale) as usize).min(BINS - 1) as u8;
-        let entry = Entry { near, first_bin: bin(first), last_bin: bin(last), space, node };
+        let entry =
+            Entry { near, corner: near, first_bin: bin(first), last_bin: bin(last), space, node };
         (!self.is_hidden(&entry)).then_some(entry)
     }
 
@@ -359,7 +427,7 @@ impl TileSolver {
                 let right =
                     self.test(context, entry.space, node.first + 1, &nodes[items.start + 1]);
                 match (left, right) {
-                    (Some(l), Some(r)) if l.near <= r.near => self.stack.extend([r, l]),
+                    (Some(l), Some(r)) if !r.comes_before(&l) => self.stack.extend([r, l]),
                     (Some(l), Some(r)) => self.stack.extend([l, r]),
                     (one, other) => self.stack.extend(one.or(other)),
                 }
@@ -390,7 +458,7 @@ impl TileSolver {
                 }
             }
         }
-        self.stack[bottom..].sort_by(|a, b| b.near.total_cmp(&a.near));
+        self.stack[bottom..].sort_by(|a, b| b.order(a));
     }
 
     #[inline(always)]
@@ -422,7 +490,8 @@ impl TileSolver {
                 if last < 0.0 || first > context.frame.length || first > last {
                     continue;
                 }
-                let near = extents.near[lane] - 2.0 * context.bounds.depth;
+                let inside = self.wedge.nearest(extents.x(lane), extents.y(lane));
+                let near = largest(extents.near[lane], inside) - 2.0 * context.bounds.depth;
                 if self.entry_if_not_hidden(context, near, first, last, 0, 0).is_none() {
                     continue;
                 }
@@ -520,12 +589,26 @@ struct Extents {
     last: [f64; LANES],
     /// Least and largest y / z; everything when a corner is not in front.
     w: [[f64; LANES]; 2],
+    /// Least and largest x.
+    x: [[f64; LANES]; 2],
+    /// Least and largest y.
+    y: [[f64; LANES]; 2],
 }
 
 impl Extents {
     #[inline(always)]
     fn rows(&self, lane: usize) -> (f64, f64) {
         (self.w[0][lane], self.w[1][lane])
+    }
+
+    #[inline(always)]
+    fn x(&self, lane: usize) -> (f64, f64) {
+        (self.x[0][lane], self.x[1][lane])
+    }
+
+    #[inline(always)]
+    fn y(&self, lane: usize) -> (f64, f64) {
+        (self.y[0][lane], self.y[1][lane])
     }
 }
 
@@ -570,11 +653,17 @@ impl FaceTriangles {
             first: [f64::INFINITY; LANES],
             last: [f64::NEG_INFINITY; LANES],
             w: [[f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]],
+            x: [[f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]],
+            y: [[f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]],
         };
         let [w_least, w_largest] = &mut out.w;
         for [x, y, z] in &self.corners {
             for lane in 0..LANES {
                 out.near[lane] = least(out.near[lane], z[lane]);
+                out.x[0][lane] = least(out.x[0][lane], x[lane]);
+                out.x[1][lane] = largest(out.x[1][lane], x[lane]);
+                out.y[0][lane] = least(out.y[0][lane], y[lane]);
+                out.y[1][lane] = largest(out.y[1][lane], y[lane]);
                 out.first[lane] = least(out.first[lane], x[lane] - c_hi * z[lane]);
                 out.last[lane] = largest(out.last[lane], x[lane] - c_lo * z[lane]);
                 // A quotient that is no number belongs to a corner that is not in front.
