@@ -209,7 +209,10 @@ impl RayCaster {
         visit: &mut impl FnMut(Hit, f64) -> f64,
     ) {
         #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
+        if is_x86_feature_detected!("avx2")
+            && is_x86_feature_detected!("bmi1")
+            && is_x86_feature_detected!("lzcnt")
+        {
             // Sound: the processor has what the function was compiled for.
             #[allow(unsafe_code)]
             return unsafe {
@@ -220,7 +223,7 @@ impl RayCaster {
     }
 
     #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
+    #[target_feature(enable = "avx2,bmi1,lzcnt")]
     fn visit_with_avx2(
         &mut self,
         geometry: &InstancedGeometry,

@@ -16,10 +16,10 @@
 //! z >= y / w_hi    z >= y / w_lo    z >= (x - L) / c_hi    z >= x / c_lo
 //! ```
 //!
-//! where the divisor has the sign of what is divided. The pixels' lists are kept by bins of t, each with the
-//! farthest depth of what covers it wholly (infinite where something shows through): see
-//! [`envelope`](crate::envelope). Above them are the farthest over the pixels of a row, and over
-//! the rows of the tile. A node is skipped when it is behind all bins that it can touch.
+//! where the divisor has the sign of what is divided. The pixels' lists are kept by bins of t,
+//! each with the farthest depth of what covers it wholly (infinite where something shows through):
+//! see [`envelope`](crate::envelope). Above them are the farthest over the pixels of a row, and
+//! over the rows of the tile. A node is skipped when it is behind all bins that it can touch.
 //!
 //! Invariant: skipping never changes the result. Boxes and bins are compared with slack for the
 //! rounding of either side, so what is skipped is behind by more than the error bound.
@@ -69,31 +69,37 @@ struct Space {
 /// How far something has to be to be inside a tile's beam.
 ///
 /// The divisors of the bounds are kept as their inverses, 0 for a side on which there is no bound: the
-/// result is then 0, which all depths are at least.
+/// result is then 0, which all depths are at least. Where a divisor is small, the rounding of what is
+/// divided counts for as much more, so that is taken off before.
 #[derive(Clone, Copy, Debug, Default)]
 struct Wedge {
-    length: f64,
-    /// Inverse of the largest and of the least c, with its sign turned.
-    columns: [f64; 2],
-    /// Inverse of the largest and of the least w, with its sign turned.
-    rows: [f64; 2],
+    /// For x - L and -x: what is taken off, and the inverse of the largest and of -(the least c).
+    columns: [(f64, f64); 2],
+    /// For y and -y: what is taken off, and the inverse of the largest and of -(the least w).
+    rows: [(f64, f64); 2],
 }
 
 impl Wedge {
-    fn new(length: f64, rows: (f64, f64), columns: (f64, f64)) -> Self {
-        let inverse = |wide: f64| if wide > 0.0 { 1.0 / wide } else { 0.0 };
+    /// The beam between the first and the last of a tile's rows and of its columns. `depth` is the
+    /// largest error of a face coordinate, metres.
+    fn new(length: f64, rows: (f64, f64), columns: (f64, f64), depth: f64) -> Self {
+        let side = |offset: f64, wide: f64| {
+            let margin = 4.0 * depth * (1.0 + wide.abs());
+            let bounds = wide > 0.0 && wide.is_finite();
+            if bounds { (offset + margin, 1.0 / wide) } else { (0.0, 0.0) }
+        };
         Self {
-            length,
-            columns: [inverse(columns.1), inverse(-columns.0)],
-            rows: [inverse(rows.1), inverse(-rows.0)],
+            columns: [side(length, columns.1), side(0.0, -columns.0)],
+            rows: [side(0.0, rows.1), side(0.0, -rows.0)],
         }
     }
 
     /// No point of the beam with these x and y (least, largest) has a lesser z.
     #[inline(always)]
     fn nearest(&self, x: (f64, f64), y: (f64, f64)) -> f64 {
-        let by_columns = largest((x.0 - self.length) * self.columns[0], -x.1 * self.columns[1]);
-        let by_rows = largest(y.0 * self.rows[0], -y.1 * self.rows[1]);
+        let bound = |value: f64, (off, inverse): (f64, f64)| (value - off) * inverse;
+        let by_columns = largest(bound(x.0, self.columns[0]), bound(-x.1, self.columns[1]));
+        let by_rows = largest(bound(y.0, self.rows[0]), bound(-y.1, self.rows[1]));
         largest(by_columns, by_rows)
     }
 }
@@ -212,7 +218,11 @@ impl TileSolver {
         found: impl FnMut(u32, usize, f64),
     ) {
         #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") && !self.portable {
+        if is_x86_feature_detected!("avx2")
+            && is_x86_feature_detected!("bmi1")
+            && is_x86_feature_detected!("lzcnt")
+            && !self.portable
+        {
             // Sound: the processor has what the function was compiled for.
             #[allow(unsafe_code)]
             return unsafe { self.solve_with_avx2(context, w, c, found) };
@@ -221,7 +231,7 @@ impl TileSolver {
     }
 
     #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
+    #[target_feature(enable = "avx2,bmi1,lzcnt")]
     fn solve_with_avx2(
         &mut self,
         context: &TileContext,
@@ -247,8 +257,8 @@ impl TileSolver {
         self.rows.extend_from_slice(w);
         self.columns.clear();
         self.columns.extend_from_slice(c);
-        let ends = (w[0], w[w.len() - 1]);
-        self.wedge = Wedge::new(context.frame.length, ends, (c[0].c, c[TILE_COLUMNS - 1].c));
+        let (rows, columns) = ((w[0], w[w.len() - 1]), (c[0].c, c[TILE_COLUMNS - 1].c));
+        self.wedge = Wedge::new(context.frame.length, rows, columns, context.bounds.depth);
         self.envelopes.clear(pixels);
         self.row_far.clear();
         self.row_far.resize(w.len(), Far::default());
@@ -691,4 +701,37 @@ fn rows_met(rows: &[f64], (least, largest): (f64, f64)) -> std::ops::Range<usize
     let before = rows.iter().filter(|&&w| w < least).count();
     let behind = rows.iter().filter(|&&w| w > largest).count();
     before..(rows.len() - behind).max(before)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Numbers of all sizes, next to 0 included.
+    fn slope() -> impl Strategy<Value = f64> {
+        (-1.0..1.0, -12..1).prop_map(|(mantissa, exponent)| mantissa * 10f64.powi(exponent))
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_in_the_beam_is_nearer_than_its_bound(
+            (w0, w1, c0, c1) in (slope(), slope(), slope(), slope()),
+            (at_row, at_column, t) in (0.0..=1.0, 0.0..=1.0, 0.0..=1.0),
+            (z, length, widen) in (0.0..1000.0, 0.01..100.0, 1.0..100.0),
+            errors in prop::array::uniform2(-1.0..1.0),
+        ) {
+            let between = |a: f64, b: f64, s: f64| (a.min(b) + s * (a - b).abs()).min(a.max(b));
+            let rows = (w0.min(w1), w0.max(w1));
+            let columns = (widen * c0.min(c1), widen * c0.max(c1));
+            let (w, c) = (between(rows.0, rows.1, at_row), between(columns.0, columns.1, at_column));
+            // A point of the beam, as far off as rounding puts the corners of a scene of this size.
+            let depth = sightline_geometry::gamma(32) * 200_000.0;
+            let x = c * z + t * length + errors[0] * depth;
+            let y = w * z + errors[1] * depth;
+            let wedge = Wedge::new(length, rows, columns, depth);
+            let near = wedge.nearest((x, x), (y, y));
+            prop_assert!(near <= z + 2.0 * depth, "{near} {z}");
+        }
+    }
 }
