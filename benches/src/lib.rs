@@ -1,7 +1,8 @@
 //! What the benchmarks share: regions, ground truth, ray tracers, clocks, and the rivals.
 //!
 //! `src/bin/compare.rs` runs every method on the same scenes in one process and writes a table
-//! and plots; `src/bin/segments.rs` times our own solves alone.
+//! and plots; `src/bin/segments.rs` times our own solves alone; `src/bin/hidden.rs` says what
+//! hidden geometry costs them.
 
 pub mod clock;
 pub mod curve;
