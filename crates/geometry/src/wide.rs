@@ -91,6 +91,7 @@ impl WideHierarchy {
                 nodes[to].set(place, node, child);
             }
         }
+        nodes.shrink_to_fit();
         Self { nodes }
     }
 }
