@@ -19,8 +19,8 @@ const STREET: [&str; 8] = [
     "--cell-size=5",
     "--eye-height=1.5,1.8",
     "--rows=92",
-    "--target-error=0.0002",
-    "--worst-error=0.002",
+    "--target-error=0.0001",
+    "--worst-error=0.001",
     "--rounds=3",
     "--verticals=false",
 ];

@@ -321,7 +321,7 @@ fn a_hard_target_gets_more_rows_and_runs_and_says_when_they_were_not_enough() {
     let (coarse, refined, again) = (finish(0), finish(2), finish(2));
     assert_eq!(refined, again, "a function of its input alone");
     let [a, b] = [&coarse.effort, &refined.effort];
-    assert!(!a.target_met && a.refinements == 0 && a.heldout_error_upper > target, "{a:?}");
+    assert!(!a.target_met && a.refinements == 0 && a.heldout_error_upper > 0.0002, "{a:?}");
     assert!(b.refinements >= 1 && b.segments == 4 * b.runs + b.lines, "{b:?}");
     assert!(b.rows > a.rows && b.rows <= 40 && b.solver_rays > a.solver_rays, "{b:?}");
     assert!(b.heldout_error_mean < a.heldout_error_mean, "{a:?} {b:?}");
