@@ -14,7 +14,7 @@ use crate::report::{bytes, print, thousands};
 
 /// Edge of a cell, metres: two side by side fill the free width of the street.
 const CELL_SIZE: f64 = 5.0;
-/// Cells along x and z. A cell takes a few core-seconds to bake and one to verify.
+/// Cells along x and z. A cell takes less than a core-second to bake, and as long to verify.
 const CELLS: [u32; 2] = [2, 14];
 
 pub fn run(command: &Demo) -> Result<()> {
