@@ -1,5 +1,6 @@
 //! The rectangle whose visible set every method looks for.
 
+use clap::Args;
 use glam::DVec3;
 use sightline_geometry::{SegmentId, ViewSegment};
 
@@ -12,6 +13,32 @@ pub struct Region {
     pub high: [f64; 2],
     /// Height of the eyes, metres.
     pub y: f64,
+}
+
+/// A scene and the rectangle in it, as the benches take them.
+#[derive(Args, Clone, Debug)]
+pub struct Place {
+    /// The scene, glTF.
+    pub scene: std::path::PathBuf,
+    /// x0,z0,x1,z1 of the rectangle, metres.
+    #[arg(long, required = true, value_delimiter = ',', allow_hyphen_values = true)]
+    pub region: Vec<f64>,
+    /// Height of the perimeter, metres.
+    #[arg(long, allow_hyphen_values = true)]
+    pub y: f64,
+}
+
+impl Place {
+    /// The rectangle.
+    ///
+    /// # Errors
+    /// When it has not four numbers, or a side has no length.
+    pub fn rectangle(&self) -> Result<Region, String> {
+        let corners: [f64; 4] = self.region[..]
+            .try_into()
+            .map_err(|_| format!("--region takes x0,z0,x1,z1, not {:?}", self.region))?;
+        Region::new(corners, self.y)
+    }
 }
 
 impl Region {

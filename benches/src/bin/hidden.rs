@@ -2,18 +2,19 @@
 //! of the scene around it that the cell cannot see.
 //!
 //! A box around the scene keeps what is visible the same; the sets are compared. Copies are bodies of
-//! their own, not instances, side by side in a square.
+//! their own, not instances, side by side in a square. The held-out rays of a viewpoint run on one
+//! thread and solves on all, so give it one thread to weigh both alike:
 //!
 //! ```sh
-//! cargo run --release -p sightline-benches --bin hidden -- CITY --region=-30,50,-20,60 --y 13.7
+//! RAYON_NUM_THREADS=1 cargo run --release -p sightline-benches --bin hidden -- CITY --region=-30,50,-20,60 --y 13.7
 //! ```
 #![allow(clippy::print_stdout)]
 
-use std::{path::PathBuf, time::Instant};
+use std::time::Instant;
 
 use clap::Parser;
 use glam::{DAffine3, DVec3};
-use sightline_benches::region::Region;
+use sightline_benches::region::Place;
 use sightline_geometry::{
     Bounds, Instance, InstancedGeometry, Mesh, MeshId, ObjectId, PrimitiveId, PrimitiveSet,
     Sampling,
@@ -24,14 +25,8 @@ use sightline_solver::{SegmentVisibility, SolveOptions, solve_segment_with};
 
 #[derive(Parser)]
 struct Arguments {
-    /// The scene, glTF.
-    scene: PathBuf,
-    /// x0,z0,x1,z1 of the rectangle, metres.
-    #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
-    region: Vec<f64>,
-    /// Height of the perimeter, metres.
-    #[arg(long, allow_hyphen_values = true)]
-    y: f64,
+    #[command(flatten)]
+    place: Place,
     /// Bodies of the scene in all, one of which is the one around the rectangle.
     #[arg(long, value_delimiter = ',', default_value = "1,4,16,64")]
     bodies: Vec<usize>,
@@ -112,9 +107,9 @@ struct Timed {
 
 fn main() {
     let arguments = Arguments::parse();
-    let scene = Scene::open(&arguments.scene, &OpenOptions::default()).expect("a readable scene");
-    let [x0, z0, x1, z1] = arguments.region[..] else { panic!("--region x0,z0,x1,z1") };
-    let region = Region::new([x0, z0, x1, z1], arguments.y).expect("a rectangle");
+    let scene =
+        Scene::open(&arguments.place.scene, &OpenOptions::default()).expect("a readable scene");
+    let region = arguments.place.rectangle().expect("a rectangle");
     let segments = region.perimeter(f64::INFINITY);
     let options =
         SolveOptions { passes: arguments.passes, threshold: 1e-6, ..SolveOptions::default() };

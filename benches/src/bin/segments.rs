@@ -6,10 +6,10 @@
 //! ```
 #![allow(clippy::print_stdout)]
 
-use std::{path::PathBuf, time::Instant};
+use std::time::Instant;
 
 use clap::Parser;
-use sightline_benches::region::Region;
+use sightline_benches::region::Place;
 use sightline_geometry::{PrimitiveSet, Sampling};
 use sightline_quality::measure_viewpoint;
 use sightline_scene::{OpenOptions, Scene};
@@ -17,14 +17,8 @@ use sightline_solver::{SolveOptions, Statistics, solve_segment_with};
 
 #[derive(Parser)]
 struct Arguments {
-    /// The scene, glTF.
-    scene: PathBuf,
-    /// x0,z0,x1,z1 of the rectangle, metres.
-    #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
-    region: Vec<f64>,
-    /// Height of the perimeter, metres.
-    #[arg(long, allow_hyphen_values = true)]
-    y: f64,
+    #[command(flatten)]
+    place: Place,
     /// Length of the pieces that the sides are cut into, metres.
     #[arg(long, default_value_t = 10.0)]
     length: f64,
@@ -62,9 +56,9 @@ struct Arguments {
 
 fn main() {
     let arguments = Arguments::parse();
-    let scene = Scene::open(&arguments.scene, &OpenOptions::default()).expect("a readable scene");
-    let [x0, z0, x1, z1] = arguments.region[..] else { panic!("--region x0,z0,x1,z1") };
-    let region = Region::new([x0, z0, x1, z1], arguments.y).expect("a rectangle");
+    let scene =
+        Scene::open(&arguments.place.scene, &OpenOptions::default()).expect("a readable scene");
+    let region = arguments.place.rectangle().expect("a rectangle");
     let segments = region.perimeter(arguments.length);
     let rows = arguments.rows;
     let sampling = Sampling::with_columns(rows, arguments.columns.unwrap_or(rows));
