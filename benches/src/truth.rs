@@ -61,7 +61,7 @@ impl Truth {
                         let mut jitter =
                             |k: u32| (f64::from(k) + random.next_unit()) / f64::from(side);
                         let direction = rotation * sphere(jitter(x), jitter(y));
-                        let ray = Ray { origin: viewpoints[viewpoint], direction };
+                        let ray = Ray::new(viewpoints[viewpoint], direction);
                         nearest(geometry, caster, ray, &mut seen);
                     }
                     seen

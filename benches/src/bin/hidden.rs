@@ -74,7 +74,7 @@ fn copies(scene: &InstancedGeometry, count: usize) -> InstancedGeometry {
             mesh: MeshId(one.mesh.0 + meshes.len() as u32),
             world_from_mesh: DAffine3::from_translation(step * size) * one.world_from_mesh,
             first_primitive: PrimitiveId(one.first_primitive.0 + next),
-            ..*one
+            ..one.clone()
         }));
         meshes.extend(scene.meshes.iter().cloned());
         next += scene.primitive_count();
@@ -87,6 +87,7 @@ fn copies(scene: &InstancedGeometry, count: usize) -> InstancedGeometry {
                 world_from_mesh: DAffine3::IDENTITY,
                 first_primitive: PrimitiveId(next),
                 occluder: true,
+                motion: None,
             });
             meshes.push(walls(Bounds { min: bounds.min - margin, max: bounds.max + margin }));
             next += 12;

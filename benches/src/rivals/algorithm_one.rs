@@ -536,7 +536,7 @@ mod tests {
                     let direction = face.transpose() * d;
                     for step in 0..=2000 {
                         let origin = s.v0.lerp(s.v1, f64::from(step) / 2000.0);
-                        let ray = Ray { origin, direction };
+                        let ray = Ray::new(origin, direction);
                         let hit = caster.closest_occluder(&geometry, ray, f64::INFINITY, |_| true);
                         if let Some(hit) = hit {
                             seen.insert(hit.primitive.0);

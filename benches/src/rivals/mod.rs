@@ -28,6 +28,7 @@ pub mod tests {
             world_from_mesh,
             first_primitive: PrimitiveId(first),
             occluder: true,
+            motion: None,
         }
     }
 

@@ -33,10 +33,8 @@ impl Tracer for Caster<'_> {
         let mut caster = RayCaster::new();
         hits.clear();
         hits.extend(rays.iter().map(|ray| {
-            let ray = Ray {
-                origin: self.origin + ray.origin.as_dvec3(),
-                direction: ray.direction.as_dvec3(),
-            };
+            let origin = self.origin + ray.origin.as_dvec3();
+            let ray = Ray::new(origin, ray.direction.as_dvec3());
             let hit = caster.closest_occluder(self.geometry, ray, f64::INFINITY, |_| true);
             hit.map_or(LocalHit::MISS, |hit| LocalHit {
                 primitive: hit.primitive.0,

@@ -101,6 +101,25 @@ impl Bounds32 {
         b
     }
 
+    /// The smallest box around both.
+    #[inline(always)]
+    #[must_use]
+    pub fn union(&self, other: &Self) -> Self {
+        let mut out = *self;
+        for k in 0..3 {
+            // Finite numbers or infinities: one instruction each, unlike `f32::min`.
+            out.min[k] = if other.min[k] < out.min[k] { other.min[k] } else { out.min[k] };
+            out.max[k] = if other.max[k] > out.max[k] { other.max[k] } else { out.max[k] };
+        }
+        out
+    }
+
+    /// True when the box holds no point.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        (0..3).any(|k| self.min[k] > self.max[k])
+    }
+
     /// Half the surface area; in `f64`, where it neither over- nor underflows. 0 for the empty box.
     #[must_use]
     pub fn half_area(&self) -> f64 {

@@ -66,14 +66,12 @@ struct Item {
     number: u32,
 }
 
-const EMPTY: Bounds32 = Bounds32 { min: [f32::INFINITY; 3], max: [f32::NEG_INFINITY; 3] };
+/// The empty box.
+pub(crate) const EMPTY: Bounds32 =
+    Bounds32 { min: [f32::INFINITY; 3], max: [f32::NEG_INFINITY; 3] };
 
 fn grow(b: &mut Bounds32, x: &Bounds32) {
-    for k in 0..3 {
-        // Finite numbers: one instruction each, unlike `f32::min`.
-        b.min[k] = if x.min[k] < b.min[k] { x.min[k] } else { b.min[k] };
-        b.max[k] = if x.max[k] > b.max[k] { x.max[k] } else { b.max[k] };
-    }
+    *b = b.union(x);
 }
 
 impl Hierarchy {

@@ -28,7 +28,7 @@ macro_rules! id {
 }
 
 id!(
-    /// Global number of a primitive (a triangle of one instance) in a scene.
+    /// Global number of a primitive (a triangle of one instance, or a particle) in a scene.
     PrimitiveId
 );
 id!(

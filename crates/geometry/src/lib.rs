@@ -18,7 +18,9 @@ mod frame;
 mod hierarchy;
 mod ids;
 mod instanced;
+pub mod motion;
 pub mod overlap;
+mod particles;
 pub mod raycast;
 mod set;
 mod view;
@@ -28,7 +30,11 @@ pub use bounds::{Bounds, Bounds32};
 pub use frame::{FACE_COUNT, Face, RectifiedFrame, Sampling};
 pub use hierarchy::{Hierarchy, Node};
 pub use ids::{CellId, InstanceId, MeshId, ObjectId, PrimitiveId, SegmentId};
-pub use instanced::{Instance, InstancedGeometry, Mesh, TopLevel, Triangle};
+pub use instanced::{
+    Instance, InstancedGeometry, Mesh, MeshMotion, MovingLevel, Place, Shape, TopLevel, Triangle,
+};
+pub use motion::{Moment, MovingHierarchy, MovingNode};
+pub use particles::{ParticleSystem, Sphere};
 pub use raycast::{Hit, Ray};
 pub use set::{PrimitiveSet, Run};
 pub use view::{ViewCell, ViewSegment};

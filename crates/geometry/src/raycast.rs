@@ -6,14 +6,20 @@
 //! shared edge hits at least one of its triangles (half-open edge signs are not needed for that:
 //! zero counts as inside).
 //!
+//! A ray is cast at a moment. What moves is met where it is then: see `moving`.
+//!
 //! Source of the triangle test: Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection"
 //! (JCGT 2013): shear the triangle so that the ray is the z axis, then take the signs of the
 //! three edge functions.
 
+mod moving;
+
+pub use moving::mesh_space;
+
 use glam::{DMat3, DVec3};
 
 use crate::{
-    InstanceId, InstancedGeometry, Mesh, PrimitiveId, TopLevel, UNIT_ROUNDOFF,
+    InstanceId, InstancedGeometry, Mesh, Moment, MovingLevel, PrimitiveId, TopLevel, UNIT_ROUNDOFF,
     instanced::Placement,
     wide::{Child, WIDTH, WideHierarchy, WideNode},
 };
@@ -25,19 +31,29 @@ pub struct Ray {
     pub origin: DVec3,
     /// Direction; distances are in units of its length.
     pub direction: DVec3,
+    /// When it is cast.
+    pub moment: Moment,
 }
 
-/// Where a ray meets a triangle.
+impl Ray {
+    /// A ray at the first key frame.
+    #[must_use]
+    pub const fn new(origin: DVec3, direction: DVec3) -> Self {
+        Self { origin, direction, moment: Moment::START }
+    }
+}
+
+/// Where a ray meets a primitive.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Distance along the ray, in units of the direction's length, > 0.
     pub distance: f64,
-    /// The triangle.
+    /// The primitive.
     pub primitive: PrimitiveId,
-    /// Its instance.
-    pub instance: InstanceId,
+    /// Its instance; none for a particle.
+    pub instance: Option<InstanceId>,
     /// True when the glTF front is met: the side from which the corners go counter-clockwise in
-    /// mesh space. Mirrored instances keep their front, as glTF has it.
+    /// mesh space. Mirrored instances keep their front, as glTF has it. Of a particle, the outside.
     pub front: bool,
 }
 
@@ -83,10 +99,16 @@ impl Sheared {
     /// A corner in the ray's sheared space, relative to its origin.
     #[inline(always)]
     fn sheared(&self, corner: &[f32; 3]) -> (f64, f64, f64) {
+        self.sheared_point(&[0, 1, 2].map(|k| f64::from(corner[k])))
+    }
+
+    /// A point in the ray's sheared space, relative to its origin.
+    #[inline(always)]
+    fn sheared_point(&self, corner: &[f64; 3]) -> (f64, f64, f64) {
         let [kx, ky, kz] = self.axes;
-        let z = f64::from(corner[kz]) - self.origin[kz];
-        let x = (f64::from(corner[kx]) - self.origin[kx]) - self.shear.x * z;
-        let y = (f64::from(corner[ky]) - self.origin[ky]) - self.shear.y * z;
+        let z = corner[kz] - self.origin[kz];
+        let x = (corner[kx] - self.origin[kx]) - self.shear.x * z;
+        let y = (corner[ky] - self.origin[ky]) - self.shear.y * z;
         (x, y, z)
     }
 
@@ -95,7 +117,12 @@ impl Sheared {
     fn triangle(&self, mesh: &Mesh, t: usize) -> Option<(f64, bool)> {
         let [a, b, c] = mesh.triangles[t];
         let corner = |v: u32| self.sheared(&mesh.positions[v as usize]);
-        let p = [corner(a), corner(b), corner(c)];
+        self.meets([corner(a), corner(b), corner(c)])
+    }
+
+    /// Distance to a triangle with these sheared corners and the sign of its determinant, if hit.
+    #[inline(always)]
+    fn meets(&self, p: [(f64, f64, f64); 3]) -> Option<(f64, bool)> {
         let u = p[2].0 * p[1].1 - p[2].1 * p[1].0;
         let v = p[0].0 * p[2].1 - p[0].1 * p[2].0;
         let w = p[1].0 * p[0].1 - p[1].1 * p[0].0;
@@ -188,6 +215,10 @@ fn root(hierarchy: &WideHierarchy) -> Option<Open> {
 struct Cast<'a> {
     geometry: &'a InstancedGeometry,
     top_level: &'a TopLevel,
+    /// What of the same kind moves.
+    moving: &'a MovingLevel,
+    /// Whether particles that hide something are meant, or those that do not.
+    occluders: bool,
     ray: Ray,
     /// Largest distance of a hit, in units of the direction's length.
     limit: f64,
@@ -198,6 +229,7 @@ struct Cast<'a> {
 pub struct RayCaster {
     top: Vec<Open>,
     bottom: Vec<Open>,
+    moving: moving::Stacks,
 }
 
 impl RayCaster {
@@ -215,6 +247,8 @@ impl RayCaster {
         accept: &mut impl FnMut(PrimitiveId) -> bool,
         visit: &mut impl FnMut(Hit, f64) -> f64,
     ) {
+        let limit = self.visit_moving(cast, accept, visit);
+        let cast = &Cast { limit, ..*cast };
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2")
             && is_x86_feature_detected!("bmi1")
@@ -245,9 +279,9 @@ impl RayCaster {
         accept: &mut impl FnMut(PrimitiveId) -> bool,
         visit: &mut impl FnMut(Hit, f64) -> f64,
     ) {
-        let Cast { geometry, top_level, ray, mut limit } = *cast;
+        let Cast { geometry, top_level, ray, mut limit, .. } = *cast;
         let relative = Sheared::new(Ray { origin: ray.origin - geometry.origin, ..ray });
-        let Self { top, bottom } = self;
+        let Self { top, bottom, .. } = self;
         top.clear();
         top.extend(root(&top_level.hierarchy.wide));
         while let Some(items) = next_leaf(&top_level.hierarchy.wide, &relative, limit, top) {
@@ -263,6 +297,7 @@ impl RayCaster {
                     Sheared::new(Ray {
                         origin: mesh_from_world.transform_point3(ray.origin),
                         direction: mesh_from_world.transform_vector3(ray.direction),
+                        ..ray
                     })
                 };
                 bottom.clear();
@@ -272,7 +307,7 @@ impl RayCaster {
                         let Some((distance, front)) = local.triangle(mesh, t) else { continue };
                         let primitive = PrimitiveId(instance.first_primitive.0 + t as u32);
                         if distance <= limit && accept(primitive) {
-                            let hit = Hit { distance, primitive, instance: id, front };
+                            let hit = Hit { distance, primitive, instance: Some(id), front };
                             limit = visit(hit, limit);
                         }
                     }
@@ -291,7 +326,14 @@ impl RayCaster {
         mut accept: impl FnMut(PrimitiveId) -> bool,
     ) -> Option<Hit> {
         let mut best: Option<Hit> = None;
-        let cast = Cast { geometry, top_level: &geometry.occluders, ray, limit };
+        let cast = Cast {
+            geometry,
+            top_level: &geometry.occluders,
+            moving: &geometry.moving_occluders,
+            occluders: true,
+            ray,
+            limit,
+        };
         self.visit(&cast, &mut accept, &mut |hit, limit| {
             let better =
                 best.is_none_or(|b| (hit.distance, hit.primitive) < (b.distance, b.primitive));
@@ -311,7 +353,14 @@ impl RayCaster {
         limit: f64,
         mut found: impl FnMut(Hit),
     ) {
-        let cast = Cast { geometry, top_level: &geometry.see_through, ray, limit };
+        let cast = Cast {
+            geometry,
+            top_level: &geometry.see_through,
+            moving: &geometry.moving_see_through,
+            occluders: false,
+            ray,
+            limit,
+        };
         self.visit(&cast, &mut |_| true, &mut |hit, limit| {
             if hit.distance < limit {
                 found(hit);
@@ -336,6 +385,7 @@ mod tests {
             world_from_mesh: DAffine3::from_translation(DVec3::new(1e7, 0.0, 0.0)),
             first_primitive: PrimitiveId(first),
             occluder,
+            motion: None,
         };
         (mesh, instance)
     }
@@ -349,7 +399,7 @@ mod tests {
     #[test]
     fn nearest_occluder_wins_far_from_the_origin() {
         let scene = scene();
-        let ray = Ray { origin: DVec3::new(1e7 + 0.25, 0.5, 0.0), direction: -DVec3::Z };
+        let ray = Ray::new(DVec3::new(1e7 + 0.25, 0.5, 0.0), -DVec3::Z);
         let mut caster = RayCaster::new();
         let hit = caster.closest_occluder(&scene, ray, f64::INFINITY, |_| true).unwrap();
         assert_eq!((hit.distance, hit.primitive.0 / 2, hit.front), (2.0, 1, true));
@@ -367,7 +417,7 @@ mod tests {
         let mut caster = RayCaster::new();
         for i in -999..1000 {
             let s = f64::from(i) / 1000.0;
-            let ray = Ray { origin: DVec3::new(1e7 + s, s, 0.0), direction: -DVec3::Z };
+            let ray = Ray::new(DVec3::new(1e7 + s, s, 0.0), -DVec3::Z);
             assert!(caster.closest_occluder(&scene, ray, f64::INFINITY, |_| true).is_some());
         }
     }
@@ -378,7 +428,7 @@ mod tests {
         let mut caster = RayCaster::new();
         for (x, y) in [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-1.0, -1.0), (1.0, 1.0)] {
             for direction in [DVec3::NEG_Z, DVec3::new(0.0, -0.0, -1.0)] {
-                let ray = Ray { origin: DVec3::new(1e7 + x, y, 0.0), direction };
+                let ray = Ray::new(DVec3::new(1e7 + x, y, 0.0), direction);
                 let hit = caster.closest_occluder(&scene, ray, f64::INFINITY, |_| true);
                 assert_eq!(hit.map(|h| h.distance), Some(2.0), "{x} {y}");
             }
@@ -417,6 +467,7 @@ mod tests {
                     world_from_mesh,
                     first_primitive: PrimitiveId(first),
                     occluder: true,
+                    motion: None,
                 });
                 first += count as u32;
             }
@@ -432,6 +483,7 @@ mod tests {
             let local = Sheared::new(Ray {
                 origin: mesh_from_world.transform_point3(ray.origin),
                 direction: mesh_from_world.transform_vector3(ray.direction),
+                ..ray
             });
             let mesh = &geometry.meshes[instance.mesh.index()];
             for t in 0..mesh.triangles.len() {
@@ -449,13 +501,20 @@ mod tests {
         let mut hits = 0;
         for i in 0..3000 {
             let [x, y, z, u, v, w] = [0, 1, 2, 3, 4, 5].map(|k| scatter(7 * i + k + 1_000_000));
-            let ray = Ray { origin: DVec3::new(x, y, z), direction: DVec3::new(u, v, w) };
+            let ray = Ray::new(DVec3::new(x, y, z), DVec3::new(u, v, w));
             let expected = nearest_of_all(&geometry, ray);
             let found = caster.closest_occluder(&geometry, ray, f64::INFINITY, |_| true);
             assert_eq!(found.map(|hit| (hit.distance, hit.primitive)), expected, "{ray:?}");
             let mut nearest: Option<(f64, PrimitiveId)> = None;
             let limit = f64::INFINITY;
-            let cast = Cast { geometry: &geometry, top_level: &geometry.occluders, ray, limit };
+            let cast = Cast {
+                geometry: &geometry,
+                top_level: &geometry.occluders,
+                moving: &geometry.moving_occluders,
+                occluders: true,
+                ray,
+                limit,
+            };
             caster.visit_anywhere(&cast, &mut |_| true, &mut |hit, limit| {
                 let this = (hit.distance, hit.primitive);
                 nearest = Some(nearest.map_or(this, |n| if this < n { this } else { n }));

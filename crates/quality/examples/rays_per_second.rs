@@ -47,6 +47,7 @@ fn main() {
             world_from_mesh: at,
             first_primitive: PrimitiveId(first),
             occluder: true,
+            motion: None,
         });
         meshes.push(mesh);
         first += count;

@@ -173,7 +173,9 @@ fn measure(
             let range = start..lattice.len().min(start + CHUNK);
             let wrong = lattice
                 .directions(batch_seed(seed, batch), range)
-                .filter(|&direction| tracer.is_wrong(geometry, &members, Ray { origin, direction }))
+                .filter(|&direction| {
+                    tracer.is_wrong(geometry, &members, Ray::new(origin, direction))
+                })
                 .count();
             (v, wrong as u32)
         })

@@ -59,7 +59,7 @@ pub fn measure_scattered(
             let mut random = SplitMix64::at(places, 3 * start as u64);
             let rays = lattice.directions(directions, range).map(|direction| {
                 let (u, v, h) = (random.next_unit(), random.next_unit(), random.next_unit());
-                Ray { origin: cell.viewpoint(u, v, h), direction }
+                Ray::new(cell.viewpoint(u, v, h), direction)
             });
             rays.filter(|&ray| tracer.is_wrong(geometry, members, ray)).map(|r| r.origin).collect()
         })

@@ -23,6 +23,7 @@ fn geometry(parts: Vec<Part>) -> InstancedGeometry {
             world_from_mesh,
             first_primitive: PrimitiveId(first),
             occluder,
+            motion: None,
         });
         first += triangles.len() as u32;
         meshes.push(Mesh::new(positions, &triangles).0);

@@ -23,7 +23,7 @@ use glam::DVec3;
 use globset::{Glob, GlobSet, GlobSetBuilder};
 use rayon::prelude::*;
 use sightline_geometry::{
-    CellId, PrimitiveId, Ray, ViewCell, overlap::primitives_in_cell, raycast::RayCaster,
+    CellId, Place, PrimitiveId, Ray, ViewCell, overlap::primitives_in_cell, raycast::RayCaster,
 };
 
 use crate::Scene;
@@ -228,9 +228,9 @@ impl<'a> Ground<'a> {
 
     fn below(&self, caster: &mut RayCaster, x: f64, z: f64) -> Option<f64> {
         let geometry = &self.scene.geometry;
-        let ray = Ray { origin: DVec3::new(x, self.start, z), direction: -DVec3::Y };
+        let ray = Ray::new(DVec3::new(x, self.start, z), -DVec3::Y);
         let is_ground = |p: PrimitiveId| {
-            let (instance, _) = geometry.locate(p);
+            let Place::Triangle(instance, _) = geometry.place(p) else { return false };
             self.is_ground[geometry.instances[instance.index()].object.index()]
         };
         let hit = caster.closest_occluder(geometry, ray, f64::INFINITY, is_ground)?;
@@ -263,14 +263,16 @@ fn is_inside_solid(
     let (mut backs, mut rays) = (0, 0);
     for direction in bundle() {
         rays += 1;
-        let ray = Ray { origin, direction };
+        let ray = Ray::new(origin, direction);
         let Some(hit) = caster.closest_occluder(geometry, ray, f64::INFINITY, |_| true) else {
             return false;
         };
-        let instance = &geometry.instances[hit.instance.index()];
-        if !hit.front && !scene.instances[hit.instance.index()].double_sided {
+        // A particle is no solid that a cell can be shut in.
+        let Some(instance) = hit.instance else { return false };
+        let object = geometry.instances[instance.index()].object;
+        if !hit.front && !scene.instances[instance.index()].double_sided {
             backs += 1;
-        } else if !ground.is_some_and(|g| g.is_told_apart && g.is_ground[instance.object.index()]) {
+        } else if !ground.is_some_and(|g| g.is_told_apart && g.is_ground[object.index()]) {
             return false;
         }
     }

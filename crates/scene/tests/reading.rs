@@ -40,7 +40,7 @@ fn a_negative_scale_keeps_world_positions() {
     let at = |x: f64, y: f64| [-x, y, 0.0];
     let expected = [[at(0., 0.), at(1., 0.), at(1., 1.)], [at(0., 0.), at(1., 1.), at(0., 1.)]];
     assert_same_triangles(&world_triangles(&scene), &expected, 0.0_f64.max(1e-12));
-    let ray = Ray { origin: [-0.25, 0.5, 1.0].into(), direction: [0.0, 0.0, -1.0].into() };
+    let ray = Ray::new([-0.25, 0.5, 1.0].into(), [0.0, 0.0, -1.0].into());
     let hit = RayCaster::new().closest_occluder(&scene.geometry, ray, 10.0, |_| true).unwrap();
     assert_eq!(hit.distance, 1.0);
 }
@@ -56,7 +56,7 @@ fn a_scale_of_zero_on_one_axis_leaves_a_flat_mesh_that_rays_hit() {
     // The second triangle repeats a corner, the third is flattened to a line.
     assert_eq!((scene.report.unique_triangles, scene.report.degenerate_triangles), (1, 2));
     assert_eq!(scene.report.degenerate[0].triangles, [1, 2]);
-    let ray = Ray { origin: [1e6 + 0.75, 0.25, 3.0].into(), direction: [0.0, 0.0, -1.0].into() };
+    let ray = Ray::new([1e6 + 0.75, 0.25, 3.0].into(), [0.0, 0.0, -1.0].into());
     let hit = RayCaster::new().closest_occluder(&scene.geometry, ray, 10.0, |_| true).unwrap();
     assert_eq!(hit.distance, 1.0);
     f.json["nodes"][0]["scale"] = json!([0.0, 0.0, 0.0]);

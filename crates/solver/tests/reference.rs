@@ -32,6 +32,7 @@ fn geometry(meshes: Vec<(Vec<[f32; 3]>, bool)>, offset: DVec3) -> InstancedGeome
             world_from_mesh: DAffine3::from_mat3_translation(turn * mirror, offset),
             first_primitive: PrimitiveId(next),
             occluder,
+            motion: None,
         });
         next += mesh.triangles.len() as u32;
         all.push(mesh);
@@ -194,6 +195,7 @@ fn closed_mesh_does_not_leak_at_shared_edges() {
             world_from_mesh: map,
             first_primitive: PrimitiveId(first),
             occluder: true,
+            motion: None,
         };
         let scene = InstancedGeometry::new(
             vec![shell.clone(), outer.clone()],
@@ -231,6 +233,7 @@ fn coplanar_triangles_go_to_the_lower_number_once() {
         world_from_mesh: map,
         first_primitive: PrimitiveId(2 * i),
         occluder: true,
+        motion: None,
     });
     let scene = InstancedGeometry::new(vec![mesh], instances.collect());
     let at = |x: f64| map.transform_point3(DVec3::new(x, 0.1, 0.0));
@@ -279,6 +282,7 @@ proptest! {
             world_from_mesh: DAffine3::IDENTITY,
             first_primitive: PrimitiveId(0),
             occluder: true,
+            motion: None,
         }]);
         let end = DVec3::new(f64::from(end.0), f64::from(end.1), f64::from(end.2));
         let seg = segment(DVec3::ZERO, end);

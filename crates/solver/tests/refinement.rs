@@ -41,6 +41,7 @@ fn room(n: usize) -> InstancedGeometry {
         world_from_mesh: DAffine3::IDENTITY,
         first_primitive: PrimitiveId(0),
         occluder: true,
+        motion: None,
     };
     InstancedGeometry::new(vec![mesh], vec![instance])
 }

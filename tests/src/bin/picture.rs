@@ -135,7 +135,7 @@ impl Camera {
     /// The ray of a point of the image; v is -1 at the bottom, 1 at the top, u likewise scaled.
     fn ray(&self, u: f64, v: f64) -> Ray {
         let direction = (self.forward + u * self.right + v * self.up).normalize();
-        Ray { origin: self.eye, direction }
+        Ray::new(self.eye, direction)
     }
 }
 
@@ -178,7 +178,7 @@ impl Painter<'_> {
         if facing <= 0.0 {
             return sky;
         }
-        let to_sun = Ray { origin: point, direction: SUN };
+        let to_sun = Ray::new(point, SUN);
         let shadow = caster.closest_occluder(self.geometry, to_sun, f64::INFINITY, &cast);
         if shadow.is_some() { sky } else { sky + 0.62 * facing }
     }
@@ -215,7 +215,7 @@ impl Painter<'_> {
             DVec3::new(angle.cos(), 0.0, angle.sin())
         };
         let mut free = |k: u32| {
-            let ray = Ray { origin: eye, direction: direction(k) };
+            let ray = Ray::new(eye, direction(k));
             caster
                 .closest_occluder(self.geometry, ray, 2000.0, |_| true)
                 .map_or(0.0, |h| h.distance)
@@ -260,7 +260,7 @@ impl Painter<'_> {
         Image::paint(width, height, |caster, x, y| {
             let ground =
                 center + metres * DVec3::new(x - width as f64 / 2.0, 0.0, y - height as f64 / 2.0);
-            let ray = Ray { origin: DVec3::new(ground.x, top, ground.z), direction: DVec3::NEG_Y };
+            let ray = Ray::new(DVec3::new(ground.x, top, ground.z), DVec3::NEG_Y);
             let Some(hit) = self.nearest(caster, ray, |_| true) else { return DVec3::ONE };
             let light = self.light(caster, ray, hit, |_| true);
             match rows.iter().find(|r| is_over(&r.cell, ground)) {

@@ -86,6 +86,7 @@ pub fn scene(
                 world_from_mesh: placed_body.world_from_mesh,
                 first_primitive: PrimitiveId(next),
                 occluder,
+                motion: None,
             });
             sources.push(InstanceSource {
                 node: draft.node,

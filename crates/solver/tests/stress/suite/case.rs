@@ -108,6 +108,7 @@ impl Scene {
             world_from_mesh,
             first_primitive: PrimitiveId(first),
             occluder,
+            motion: None,
         });
         self.meshes.push(mesh);
         first..self.primitives

@@ -67,6 +67,7 @@ pub fn taken_apart(case: &Case) -> Case {
                 world_from_mesh: instance.world_from_mesh,
                 first_primitive: PrimitiveId(primitive),
                 occluder: instance.occluder,
+                motion: None,
             });
         }
     }
@@ -83,6 +84,7 @@ pub fn taken_apart(case: &Case) -> Case {
             world_from_mesh: instance.world_from_mesh,
             first_primitive: PrimitiveId(primitive),
             occluder: instance.occluder,
+            motion: None,
         });
     }
     Case {
