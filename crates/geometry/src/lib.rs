@@ -23,6 +23,7 @@ pub mod overlap;
 mod particles;
 pub mod raycast;
 mod set;
+mod state_sets;
 mod view;
 mod wide;
 
@@ -37,6 +38,7 @@ pub use motion::{Moment, MovingHierarchy, MovingNode};
 pub use particles::{ParticleSystem, Sphere};
 pub use raycast::{Hit, Ray};
 pub use set::{PrimitiveSet, Run};
+pub use state_sets::StateSets;
 pub use view::{ViewCell, ViewSegment};
 
 /// Unit roundoff of `f64`, 2^-53: the relative error of one correctly rounded operation.

@@ -25,6 +25,8 @@ pub mod cut;
 pub mod envelope;
 pub mod reference;
 mod segment;
+mod states;
 mod tile;
 
 pub use segment::{SegmentVisibility, SolveOptions, Statistics, solve_segment, solve_segment_with};
+pub use states::{Known, StateVisibility, TimePath, solve_states};
