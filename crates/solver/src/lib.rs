@@ -24,6 +24,7 @@ pub mod bounds;
 pub mod cut;
 pub mod envelope;
 pub mod reference;
+pub mod quadratic;
 mod segment;
 mod states;
 mod tile;
