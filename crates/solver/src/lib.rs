@@ -20,11 +20,14 @@
 //! [`mod@reference`] solves the same definition in exact rational arithmetic, with no culling and no
 //! floats; the tests compare the two.
 
+pub mod arc;
+pub mod bernstein;
 pub mod bounds;
 pub mod cut;
 pub mod envelope;
-pub mod reference;
+pub mod moving;
 pub mod quadratic;
+pub mod reference;
 mod segment;
 mod states;
 mod tile;
