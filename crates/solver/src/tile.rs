@@ -621,6 +621,7 @@ impl TileSolver {
                     if self.envelopes.insert(pixel, line, a, b) {
                         self.row_far[row].stale = true;
                         self.tile_far.stale = true;
+                        self.moving.changed = true;
                     }
                 }
                 Pass::SeeThrough => {

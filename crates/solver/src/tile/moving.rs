@@ -88,8 +88,8 @@ pub(super) struct MovingSolver {
     base_rows: Vec<Far>,
     base_tile: Far,
     base_seen_through: Vec<(u32, u32, f64)>,
-    /// True when something that moves is in the lists.
-    changed: bool,
+    /// True when something came into the lists since this was last set to false.
+    pub(super) changed: bool,
 }
 
 /// A walk of what moves, in one state.
