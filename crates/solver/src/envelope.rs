@@ -218,6 +218,30 @@ struct Piece {
     line: u32,
 }
 
+/// A visibility interval: a stretch of t on which a primitive is nearest at a pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Interval {
+    /// The primitive.
+    pub primitive: u32,
+    /// Start, in [0, 1).
+    pub start: f64,
+    /// End, in (0, 1].
+    pub end: f64,
+    /// Largest error of the start: that of the primitive's own end, or of what it meets there.
+    pub start_error: f64,
+    /// Largest error of the end.
+    pub end_error: f64,
+}
+
+impl Interval {
+    /// True when it is longer than what its ends may be off by: rounding alone makes nothing visible.
+    #[inline(always)]
+    #[must_use]
+    pub fn counts(&self) -> bool {
+        self.end - self.start > self.start_error + self.end_error
+    }
+}
+
 /// Where the pieces of a bin are.
 #[derive(Clone, Copy, Debug, Default)]
 struct Bin {
@@ -501,42 +525,46 @@ impl Envelopes {
         &self.pieces[bin.first as usize..(bin.first + bin.len) as usize]
     }
 
-    /// Calls `found(primitive, length, error)` for every interval of a pixel, in order of t; pieces of a
-    /// line that meet at the border of two bins are one interval. `error` is what its length may be
-    /// off by, with that of an end of a line at this column, `time_error`, given: an end may be that
-    /// of the interval's own line or of one that it meets there.
+    /// Calls `found` with every interval of a pixel, in order of t; pieces of a line that meet at the
+    /// border of two bins are one interval. `time_error` is that of the ends of lines at this column.
     #[inline(always)]
-    pub fn intervals(&self, pixel: usize, time_error: f64, mut found: impl FnMut(u32, f64, f64)) {
-        let of = |piece: &Piece| match self.arcs.get(self.lines[piece.line as usize].arc as usize) {
+    pub fn intervals(&self, pixel: usize, time_error: f64, mut found: impl FnMut(Interval)) {
+        let error_of = |line: u32| match self.arcs.get(self.lines[line as usize].arc as usize) {
             Some(arc) => largest(arc.time_error, time_error),
             None => time_error,
         };
         let mut open = Piece::default();
-        // What is before the open piece, where both meet.
+        // The error of what is before the open piece, where both meet.
         let mut before = time_error;
+        let mut close = |open: &Piece, before: f64, behind: f64| {
+            let own = error_of(open.line);
+            found(Interval {
+                primitive: self.lines[open.line as usize].primitive,
+                start: open.t0,
+                end: open.t1,
+                start_error: largest(own, before),
+                end_error: largest(own, behind),
+            });
+            own
+        };
         for bin in 0..BINS {
             for piece in self.of(pixel * BINS + bin) {
                 if piece.line == open.line && piece.t0 == open.t1 {
                     open.t1 = piece.t1;
                 } else {
                     let meets = piece.t0 == open.t1;
-                    let mut ends_at = time_error;
+                    let mut passed = time_error;
                     if open.t0 < open.t1 {
-                        let own = of(&open);
-                        let behind = if meets { of(piece) } else { time_error };
-                        let error = largest(own, before) + largest(own, behind);
-                        found(self.lines[open.line as usize].primitive, open.t1 - open.t0, error);
-                        ends_at = own;
+                        let behind = if meets { error_of(piece.line) } else { time_error };
+                        passed = close(&open, before, behind);
                     }
-                    before = if meets { ends_at } else { time_error };
+                    before = if meets { passed } else { time_error };
                     open = *piece;
                 }
             }
         }
         if open.t0 < open.t1 {
-            let own = of(&open);
-            let error = largest(own, before) + own;
-            found(self.lines[open.line as usize].primitive, open.t1 - open.t0, error);
+            close(&open, before, time_error);
         }
     }
 

@@ -25,6 +25,7 @@ pub mod bernstein;
 pub mod bounds;
 pub mod cut;
 pub mod envelope;
+mod lists;
 pub mod moving;
 pub mod quadratic;
 pub mod reference;
@@ -32,5 +33,6 @@ mod segment;
 mod states;
 mod tile;
 
+pub use lists::{Pixel, visit_intervals};
 pub use segment::{SegmentVisibility, SolveOptions, Statistics, solve_segment, solve_segment_with};
 pub use states::{Known, StateVisibility, TimePath, solve_states};

@@ -237,8 +237,7 @@ mod tests {
         // Subnormal roots are rounded once more.
         // Where both are, the signs around one of them tell nothing of it.
         let both_tiny = matches!(found, Roots::Two(s, t) if s.abs().max(t.abs()) < 1e-300);
-        let near =
-            |t: f64| both_tiny || is_root(a, b, c, t, 4 + i64::from(t.abs() < 1e-290));
+        let near = |t: f64| both_tiny || is_root(a, b, c, t, 4 + i64::from(t.abs() < 1e-290));
         match found {
             Roots::None => assert_eq!(expected, 0, "{a:e} {b:e} {c:e}"),
             Roots::Simple(t) => assert!(expected == 1 && near(t), "{a:e} {b:e} {c:e} {t:e}"),

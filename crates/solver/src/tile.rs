@@ -36,7 +36,7 @@ use sightline_geometry::{
 use crate::{
     bounds::ErrorBounds,
     cut::Cut,
-    envelope::{BINS, Column, Envelopes, Line, bin_of, largest, least},
+    envelope::{BINS, Column, Envelopes, Interval, Line, bin_of, largest, least},
     states::TimePath,
 };
 
@@ -303,6 +303,12 @@ impl TileSolver {
         }
     }
 
+    /// Calls `found` with the intervals of a pixel of the last state that was solved.
+    pub fn intervals(&self, pixel: usize, found: impl FnMut(Interval)) {
+        let time_error = self.columns[pixel % TILE_COLUMNS].time_error;
+        self.envelopes.intervals(pixel, time_error, found);
+    }
+
     /// Calls `found` with what the lists hold.
     #[inline(always)]
     fn report(&mut self, pixels: usize, when: When, found: &mut impl FnMut(When, u32, usize, f64)) {
@@ -311,10 +317,10 @@ impl TileSolver {
         for pixel in 0..pixels {
             let time_error = self.columns[pixel % TILE_COLUMNS].time_error;
             let mut intervals = 0;
-            self.envelopes.intervals(pixel, time_error, |primitive, length, error| {
+            self.envelopes.intervals(pixel, time_error, |interval| {
                 intervals += 1;
-                if length > error {
-                    found(when, primitive, pixel, length);
+                if interval.counts() {
+                    found(when, interval.primitive, pixel, interval.end - interval.start);
                 }
             });
             self.counters.intervals += intervals;

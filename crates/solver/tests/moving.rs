@@ -6,8 +6,7 @@ use glam::{DAffine3, DQuat, DVec3};
 use proptest::prelude::*;
 use sightline_geometry::{
     FACE_COUNT, Instance, InstancedGeometry, Mesh, MeshId, Moment, ObjectId, ParticleSystem,
-    PrimitiveId, Ray, RectifiedFrame, Sampling, SegmentId, Sphere, ViewSegment,
-    raycast::RayCaster,
+    PrimitiveId, Ray, RectifiedFrame, Sampling, SegmentId, Sphere, ViewSegment, raycast::RayCaster,
 };
 use sightline_solver::{SolveOptions, StateVisibility, TimePath, solve_states};
 
@@ -77,7 +76,10 @@ fn compare(geometry: &InstancedGeometry, segment: &ViewSegment, path: TimePath) 
         let alone =
             solve_states(geometry, segment, sampling, state..state + 1, path, None, &options);
         let run = runs.iter().find(|run| run.states.contains(&state)).unwrap();
-        assert_eq!(alone[0].visibility.set, run.visibility.set, "each state is as if it were alone");
+        assert_eq!(
+            alone[0].visibility.set, run.visibility.set,
+            "each state is as if it were alone"
+        );
         assert_eq!(alone[0].visibility.weights, run.visibility.weights);
         let found = weights(run);
         let seen = picture(geometry, segment, sampling, state, path);
@@ -128,10 +130,16 @@ fn scene() -> impl Strategy<Value = InstancedGeometry> {
     let points = |n: usize| prop::collection::vec(point(4.0), 3 * n);
     let turns = prop::collection::vec((point(1.0), 0.0..3.0, point(3.0)), 3);
     let spheres = prop::collection::vec((point(4.0), 0.1..1.2), 0..8);
-    (points(4), prop::collection::vec(points(5), 3), points(4), turns, spheres.prop_flat_map(|s| {
-        let n = s.len();
-        (Just(s), prop::collection::vec((point(2.0), 0.5..1.5), 3 * n))
-    }))
+    (
+        points(4),
+        prop::collection::vec(points(5), 3),
+        points(4),
+        turns,
+        spheres.prop_flat_map(|s| {
+            let n = s.len();
+            (Just(s), prop::collection::vec((point(2.0), 0.5..1.5), 3 * n))
+        }),
+    )
         .prop_map(|(still, changing, carried, turns, (spheres, moves))| {
             let meshes = vec![
                 Mesh::new(stored(&still), &soup(4)).0,
