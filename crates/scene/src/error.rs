@@ -482,7 +482,8 @@ impl SceneError {
     pub fn help(&self) -> Option<String> {
         let text = match &*self.cause {
             Cause::Read { .. } | Cause::NotAFile => {
-                "give the path of a .gltf, .glb, .parquet or .csv file that this user can read".into()
+                "give the path of a .gltf, .glb, .parquet or .csv file that this user can read"
+                    .into()
             }
             Cause::Table(problem) => problem.help().into(),
             Cause::Pattern { .. } => {

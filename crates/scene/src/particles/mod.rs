@@ -157,8 +157,7 @@ impl Survey {
     fn enter_key_frame(&mut self, row: &Row) -> Result<(), TableProblem> {
         let (place, state) = (row.place, row.state);
         let time = row.time.unwrap_or(f64::from(state));
-        let wrong_time =
-            |other, rule| Err(TableProblem::Time { place, time, other, rule });
+        let wrong_time = |other, rule| Err(TableProblem::Time { place, time, other, rule });
         let known = self.key_times.len();
         match (state as usize, self.key_times.last()) {
             (now, Some(&other)) if now + 1 == known => {
@@ -368,13 +367,10 @@ pub(crate) fn states(key_times: &[f64]) -> u32 {
 }
 
 /// Names, sizes and hashes of tables.
-pub(crate) fn files(
-    paths: &[PathBuf],
-) -> Result<Vec<(String, u64, blake3::Hash)>, SceneError> {
+pub(crate) fn files(paths: &[PathBuf]) -> Result<Vec<(String, u64, blake3::Hash)>, SceneError> {
     let hashed = |path: &PathBuf| {
-        let (size, hash) = Source::open(path)
-            .and_then(|source| source.hash())
-            .map_err(|e| e.in_file(path))?;
+        let (size, hash) =
+            Source::open(path).and_then(|source| source.hash()).map_err(|e| e.in_file(path))?;
         Ok((file_name(path), size, hash))
     };
     paths.iter().map(hashed).collect()

@@ -308,11 +308,7 @@ fn parquet_rows<T: ChunkReader + 'static>(input: T, each: Each<'_>) -> Result<()
     }
 }
 
-fn check_type(
-    column: &'static str,
-    integer: bool,
-    found: &DataType,
-) -> Result<(), TableProblem> {
+fn check_type(column: &'static str, integer: bool, found: &DataType) -> Result<(), TableProblem> {
     let float = matches!(found, DataType::Float32 | DataType::Float64);
     if found.is_integer() || (float && !integer) {
         return Ok(());
@@ -326,7 +322,8 @@ fn batch_rows(batch: &RecordBatch, first: u64, each: Each<'_>) -> Result<(), Tab
     let column = |k: usize| batch.column_by_name(COLUMNS[k]).map(|array| (k, &**array));
     let place = |row: usize| RowPlace { row: first + row as u64, line: None };
     for (k, array) in (0..COLUMNS.len()).filter_map(column) {
-        if let Some(row) = (0..array.len()).find(|&row| array.null_count() > 0 && array.is_null(row))
+        if let Some(row) =
+            (0..array.len()).find(|&row| array.null_count() > 0 && array.is_null(row))
         {
             return Err(TableProblem::Value {
                 place: place(row),
