@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use arrow_array::{ArrayRef, Float32Array, Float64Array, Int64Array, RecordBatch, UInt64Array};
-use fixtures::{Fixture, mutate::Rng};
+use fixtures::{Fixture, golden, mutate::Rng};
 use glam::DVec3;
 use parquet::arrow::ArrowWriter;
 use parquet::basic::{Compression, GzipLevel};
@@ -403,6 +403,31 @@ fn small_tables_do_not_take_much_memory() {
     assert!(error.to_string().contains("24 spheres"), "{error}");
     options.max_spheres = 24;
     Scene::open(&drops, &options).unwrap();
+}
+
+#[test]
+fn golden_tables_are_written_and_read_as_ever() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../schemas/golden/particles-v1");
+    for (name, format) in golden::TABLES {
+        let path = folder.join(name);
+        assert!(std::fs::read(&path).unwrap() == golden::bytes(format).unwrap(), "{name}");
+        let table = read_table(&path, 100).unwrap();
+        assert_eq!(table.ids, [1, 2, 3, 1000]);
+        let wanted = golden::key_frames();
+        assert_eq!(table.key_times, wanted.iter().map(|(time, _)| *time).collect::<Vec<_>>());
+        for ((_, there), keys) in wanted.into_iter().zip(&table.keys) {
+            for (id, sphere) in table.ids.iter().zip(keys) {
+                match there.iter().find(|(wanted, _)| wanted == id) {
+                    None => assert_eq!(*sphere, Sphere::ABSENT, "particle {id}"),
+                    Some((_, wanted)) => {
+                        assert_eq!(sphere.radius, wanted.radius);
+                        let center = sphere.center() + table.origin;
+                        assert!((center - wanted.center()).length() < 1e-6, "particle {id}");
+                    }
+                }
+            }
+        }
+    }
 }
 
 /// Small valid tables.

@@ -164,8 +164,9 @@ fn phases(document: &mut Document, states: u32) -> [SamplerKey; PHASES] {
 fn sway(solid: &Solid) -> [Vec<[f32; 3]>; 2] {
     let displaced = |direction: DVec3, wave: f64| {
         let of = |p: &[f32; 3]| {
-            let [x, y, z] = p.map(f64::from);
-            let height = (y + ROOT).max(0.0) / (0.5 + ROOT);
+            let [x, _, z] = p.map(f64::from);
+            // In `f32`, as roots are stored: they do not move at all.
+            let height = f64::from((p[1] + ROOT as f32).max(0.0)) / (0.5 + ROOT);
             let gust = 0.8 + 0.2 * sin_cos(wave * x + 5.0 * z).0;
             (SWAY * height * height * gust * direction).as_vec3().to_array()
         };
