@@ -175,7 +175,10 @@ fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
 fn the_bytes_are_pinned() {
     let hash = |kind| blake3::hash(&bytes_of(kind, 60_000, 1).1).to_hex()[..16].to_owned();
     let pinned = [Kind::City, Kind::Town, Kind::Grass, SWAYING].map(hash);
-    assert_eq!(pinned, ["840d1577a877beef", "abd054e4e3fb3f7f", "4a0c0925ce098f0e", "e4045b18bb14d863"]);
+    assert_eq!(
+        pinned,
+        ["840d1577a877beef", "abd054e4e3fb3f7f", "4a0c0925ce098f0e", "e4045b18bb14d863"]
+    );
     let hash = |format| blake3::hash(&spheres_of(2000, 5, 1, format).1).to_hex()[..16].to_owned();
     let pinned = [TableFormat::Parquet, TableFormat::Csv].map(hash);
     assert_eq!(pinned, ["79f092b453989c1a", "47d6f844a31a1c84"]);
@@ -487,7 +490,7 @@ fn spheres_bounce_apart_from_each_other_and_come_to_rest() {
         assert!(last.iter().all(|s| low(s) == 0.0), "all rest on the ground");
         assert!(table.keys.iter().flatten().all(|s| low(s) >= 0.0), "none is in the ground");
         let high = |key: usize| table.keys[key].iter().map(low).sum::<f64>() / 10_000.0;
-        assert!(high(0) > 3.0 && high(12) < high(0) && high(20) < 0.2, "they lose energy");
+        assert!(high(0) > 1.2 && high(12) < high(0) && high(20) < 0.2, "they lose energy");
         // A column of 1 m each: none ever meets another.
         let mut columns: Vec<[i64; 2]> = vec![];
         for s in last {

@@ -8,13 +8,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use arrow_array::{ArrayRef, Float32Array, Float64Array, Int64Array, RecordBatch, UInt64Array};
-use fixtures::{Fixture, golden, mutate::Rng};
+use fixtures::{Fixture, assert_valid, golden, mutate::Rng};
 use glam::DVec3;
 use parquet::arrow::ArrowWriter;
 use parquet::basic::{Compression, GzipLevel};
 use parquet::file::properties::WriterProperties;
 use proptest::prelude::*;
-use sightline_geometry::{Moment, PrimitiveId, Shape, Sphere};
+use sightline_geometry::{Moment, PrimitiveId, PrimitiveSet, Shape, Sphere};
+use sightline_scene::export::export_visible;
 use sightline_scene::particles::{NO_NODE, TableFormat, TableWriter, read_table};
 use sightline_scene::{Cause, OpenOptions, Scene, SceneError, TableProblem, digest, digest_with};
 
@@ -427,6 +428,42 @@ fn golden_tables_are_written_and_read_as_ever() {
                 }
             }
         }
+    }
+}
+
+#[test]
+fn exported_particles_are_instances_of_a_sphere() {
+    let folder = tempfile::tempdir().unwrap();
+    let glb = write(folder.path(), "square.glb", Fixture::square().glb());
+    let drops = write(folder.path(), "drops.csv", CSV);
+    let mut options = OpenOptions::default();
+    options.particles = vec![drops.clone()];
+    // With a scene of triangles and alone; particle 40 is not there in the first state.
+    for (main, options, triangles) in [(&glb, &options, 2), (&drops, &OpenOptions::default(), 0)] {
+        let scene = Scene::open(main, options).unwrap();
+        let out = folder.path().join("visible.glb");
+        let count = scene.geometry.primitive_count();
+        let report =
+            export_visible(main, &scene, &PrimitiveSet::from_sorted(0..count), &out).unwrap();
+        assert_eq!((report.triangles, report.particles), (triangles, 2));
+        assert_eq!(report.warnings, ["particles that are not there yet are left out (drops)"]);
+        assert_valid(&[&out]);
+        let exported = Scene::open(&out, &OpenOptions::default()).unwrap();
+        let object = exported.objects.iter().find(|o| o.name == "drops").unwrap();
+        assert_eq!(object.primitives.len(), 2 * 80);
+        // Particle 7 at (1, 2, 3) with radius 0.5, and particle 9 at (0, 8, 0) with radius 1.
+        for p in object.primitives.clone() {
+            for corner in exported.geometry.triangle(PrimitiveId(p)).corners {
+                let off = |center: DVec3, radius: f64| ((corner - center).length() - radius).abs();
+                let near = off(DVec3::new(1.0, 2.0, 3.0), 0.5).min(off(DVec3::Y * 8.0, 1.0));
+                assert!(near < 1e-5, "{corner}");
+            }
+        }
+        // Without particles in the set the file has none.
+        let none = PrimitiveSet::from_sorted(0..triangles as u32);
+        let report = export_visible(main, &scene, &none, &out).unwrap();
+        assert_eq!((report.particles, report.warnings.len()), (0, 0));
+        assert_valid(&[&out]);
     }
 }
 

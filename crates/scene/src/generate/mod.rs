@@ -143,6 +143,14 @@ struct Made {
     suggested_eye_height: [f64; 2],
 }
 
+/// A tessellated sphere of radius 1: vertices and 80 triangles.
+pub(crate) fn unit_sphere() -> (Vec<[f32; 3]>, Vec<[u32; 3]>) {
+    let mut sphere = solid::Solid::new();
+    sphere.blob(material::Material::Lamp, glam::DVec3::ZERO, |_| 1.0);
+    let triangles = sphere.parts.into_iter().flat_map(|part| part.triangles).collect();
+    (sphere.positions, triangles)
+}
+
 fn check_states(states: u32) -> Result<(), GenerateError> {
     if STATES_RANGE.contains(&states) {
         Ok(())
