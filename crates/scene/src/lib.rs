@@ -19,4 +19,4 @@ pub use digest::{FileDigest, SceneDigest, digest};
 pub use error::{Cause, Place, SceneError, UriProblem};
 pub use numbering::morton;
 pub use report::{DegenerateTriangles, IngestReport, SkippedPrimitives};
-pub use scene::{InstanceSource, MeshSource, Object, OpenOptions, Scene};
+pub use scene::{AnimationChoice, InstanceSource, MeshSource, Object, OpenOptions, Scene};

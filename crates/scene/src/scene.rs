@@ -6,11 +6,14 @@
 //! - every object has at least one triangle;
 //! - `meshes` is parallel to `geometry.meshes`, `instances` to `geometry.instances`;
 //! - every mesh has at least one triangle and one instance, and only vertices that a triangle
-//!   uses, in the order in which the hierarchy's triangles use them.
+//!   uses, in the order in which the hierarchy's triangles use them;
+//! - key times ascend from 0, and there is one more than there are states; a scene at rest has
+//!   one, and one state;
+//! - what has a value a key frame is not the same at all of them.
 
 use std::{ops::Range, path::Path};
 
-use sightline_geometry::{Bounds, InstancedGeometry, ObjectId};
+use sightline_geometry::{Bounds, Bounds32, InstancedGeometry, Moment, ObjectId};
 
 use crate::{IngestReport, SceneDigest, SceneError, gltf_reader};
 
@@ -25,13 +28,51 @@ pub struct OpenOptions {
     pub max_unique_triangles: u64,
     /// Refuse scenes with more instances than this. An instance takes about 300 bytes.
     pub max_instances: u64,
+    /// Which animation moves the scene.
+    pub animation: AnimationChoice,
+    /// Between two key frames every vertex moves linearly; no vertex is then farther than this from
+    /// where the animation puts it, at any time but within the short states of jumps. Metres, above
+    /// 0.
+    pub motion_error: f64,
+    /// Refuse animations that need more states than this.
+    pub max_states: u32,
+    /// Refuse scenes that would keep more positions of moving things than this: vertices that move
+    /// on their own and corners of the boxes of moving instances, once a key frame. A position takes
+    /// 12 bytes.
+    pub max_moving_positions: u64,
 }
 
 impl Default for OpenOptions {
-    /// No see-through patterns, 2^28 unique triangles, 2^24 instances.
+    /// No see-through patterns, 2^28 unique triangles, 2^24 instances; the first animation within
+    /// 0.01 m, 4096 states, 2^28 moving positions.
     fn default() -> Self {
-        Self { see_through: Vec::new(), max_unique_triangles: 1 << 28, max_instances: 1 << 24 }
+        Self {
+            see_through: Vec::new(),
+            max_unique_triangles: 1 << 28,
+            max_instances: 1 << 24,
+            animation: AnimationChoice::First,
+            motion_error: 0.01,
+            max_states: 4096,
+            max_moving_positions: 1 << 28,
+        }
     }
+}
+
+/// Which of a file's animations moves the scene. After its last key a channel holds its value, and so
+/// it does before its first.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum AnimationChoice {
+    /// The first one; none where the file has none.
+    #[default]
+    First,
+    /// None: the scene is at rest, in the pose of its nodes.
+    None,
+    /// All of them, started together. Two that move the same property of a node are refused.
+    All,
+    /// The one with this index into `animations`.
+    Index(u32),
+    /// The first one with this name.
+    Name(String),
 }
 
 /// What the author named: a node with at least one triangle.
@@ -91,6 +132,9 @@ pub struct Scene {
     pub meshes: Vec<MeshSource>,
     /// Parallel to the instances of `geometry`.
     pub instances: Vec<InstanceSource>,
+    /// Times of the key frames, seconds, ascending from 0: one more than the geometry has states. A
+    /// scene at rest has one key frame, and one state.
+    pub key_times: Vec<f64>,
     /// What reading found.
     pub report: IngestReport,
     /// Hashes of the files.
@@ -98,7 +142,8 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Reads a `.gltf` or `.glb` file: the default scene, at rest.
+    /// Reads a `.gltf` or `.glb` file: the default scene, moved by the animation that the options
+    /// choose.
     ///
     /// # Errors
     /// When the file cannot be read, breaks a rule of glTF that its triangles depend on, or is
@@ -114,6 +159,27 @@ impl Scene {
     /// As [`Scene::open`].
     pub fn open_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Self, SceneError> {
         gltf_reader::read_bytes(path, main, options).map_err(|e| e.in_file(path))
+    }
+
+    /// The moment at a time in seconds; times before the first key frame are taken for it, times
+    /// after the last one for that. A key frame is the beginning of the state that it starts.
+    #[must_use]
+    pub fn moment_at(&self, seconds: f64) -> Moment {
+        let times = &self.key_times;
+        // Also where the time is NaN.
+        if times.len() < 2 || !(seconds > times[0]) {
+            return Moment::START;
+        }
+        let state = times.partition_point(|&t| t <= seconds).min(times.len() - 1) - 1;
+        let (from, to) = (times[state], times[state + 1]);
+        Moment { state: state as u32, t: ((seconds - from) / (to - from)).min(1.0) }
+    }
+
+    /// The time of a moment, seconds.
+    #[must_use]
+    pub fn time_of(&self, moment: Moment) -> f64 {
+        let (from, to) = sightline_geometry::motion::around(&self.key_times, moment.state);
+        (1.0 - moment.t) * from + moment.t * to
     }
 
     /// Panics when an invariant of the module does not hold.
@@ -138,6 +204,7 @@ impl Scene {
             assert!(object.occluder || !instance.occluder);
         }
         assert!(placed.iter().all(|&p| p), "every mesh is placed");
+        self.assert_motion_is_well_formed();
         for (mesh, source) in g.meshes.iter().zip(&self.meshes) {
             assert_eq!(mesh.triangles.len(), source.triangles.len());
             assert!(!mesh.triangles.is_empty());
@@ -147,14 +214,47 @@ impl Scene {
                 next = next.max(v + 1);
             }
             assert_eq!(next as usize, mesh.positions.len(), "every vertex is used");
-            let boxes: Vec<_> = mesh
-                .triangles
-                .iter()
-                .map(|t| {
-                    sightline_geometry::Bounds32::of_points(t.map(|v| mesh.positions[v as usize]))
-                })
-                .collect();
-            mesh.hierarchy.assert_well_formed(&boxes);
+            let box_of = |positions: &[[f32; 3]], t: usize| {
+                Bounds32::of_points(mesh.triangles[t].map(|v| positions[v as usize]))
+            };
+            let count = mesh.triangles.len();
+            match &mesh.motion {
+                None => {
+                    let boxes: Vec<_> = (0..count).map(|t| box_of(&mesh.positions, t)).collect();
+                    mesh.hierarchy.assert_well_formed(&boxes);
+                }
+                Some(motion) => {
+                    assert!(mesh.hierarchy.nodes.is_empty(), "one hierarchy a mesh");
+                    let box_of = |t: usize, key: usize| box_of(&motion.keys[key], t);
+                    motion.hierarchy.assert_well_formed(count, box_of);
+                }
+            }
+        }
+    }
+
+    fn assert_motion_is_well_formed(&self) {
+        let (g, times) = (&self.geometry, &self.key_times);
+        assert_eq!(times[0], 0.0, "the first key frame is at 0");
+        assert!(times.windows(2).all(|pair| pair[0] < pair[1]), "key times ascend");
+        let keys = g.states as usize + 1;
+        if times.len() == 1 {
+            assert!(g.states == 1 && !g.has_motion(), "one key frame is of a scene at rest");
+        } else {
+            assert_eq!(times.len(), keys, "key frames and states");
+            assert!(g.has_motion(), "a scene of several key frames moves");
+        }
+        for maps in g.instances.iter().filter_map(|i| Some((i, i.motion.as_deref()?))) {
+            let (instance, maps) = maps;
+            assert_eq!(maps.len(), keys);
+            assert_eq!(maps[0], instance.world_from_mesh, "at the first key frame");
+            assert!(maps.iter().all(|m| m.is_finite()));
+        }
+        for (mesh, motion) in g.meshes.iter().filter_map(|m| Some((m, m.motion.as_ref()?))) {
+            assert_eq!(motion.keys.len(), keys);
+            assert_eq!(motion.keys[0], mesh.positions, "at the first key frame");
+            let same = |key: &Vec<[f32; 3]>| key.len() == mesh.positions.len();
+            assert!(motion.keys.iter().all(same), "every vertex has a place a key frame");
+            assert!(motion.moves.contains(&true), "what does not move has one value");
         }
     }
 }

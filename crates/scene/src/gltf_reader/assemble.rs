@@ -111,7 +111,15 @@ pub fn scene(
         unique.bodies.into_iter().map(|b| (b.mesh, b.source)).unzip();
     let geometry = InstancedGeometry::new(bodies, instances);
     count(&mut report, &geometry, objects.len());
-    Ok(Scene { geometry, objects, meshes, instances: sources, report, digest: buffers.digest() })
+    Ok(Scene {
+        geometry,
+        objects,
+        meshes,
+        instances: sources,
+        key_times: vec![0.0],
+        report,
+        digest: buffers.digest(),
+    })
 }
 
 fn count(report: &mut IngestReport, geometry: &InstancedGeometry, objects: usize) {
