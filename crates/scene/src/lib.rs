@@ -18,5 +18,5 @@ mod scene;
 pub use digest::{FileDigest, SceneDigest, digest};
 pub use error::{Cause, Place, SceneError, UriProblem};
 pub use numbering::morton;
-pub use report::{DegenerateTriangles, IngestReport, SkippedPrimitives};
+pub use report::{DegenerateTriangles, IgnoredChannels, IngestReport, SkippedPrimitives};
 pub use scene::{AnimationChoice, InstanceSource, MeshSource, Object, OpenOptions, Scene};

@@ -116,6 +116,9 @@ pub struct InstanceSource {
     pub gpu_instance: Option<u32>,
     /// Index into the `primitives` of the node's mesh.
     pub primitive: u32,
+    /// True when an animation or a skin may place it, so that the nodes of the file and their weights
+    /// alone do not say where it is.
+    pub posed: bool,
     /// True when the material shows the back of its triangles: seeing a back does not mean
     /// being inside.
     pub double_sided: bool,
