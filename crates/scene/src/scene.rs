@@ -169,8 +169,7 @@ impl Scene {
     #[must_use]
     pub fn moment_at(&self, seconds: f64) -> Moment {
         let times = &self.key_times;
-        // Also where the time is NaN.
-        if times.len() < 2 || !(seconds > times[0]) {
+        if times.len() < 2 || seconds.is_nan() || seconds <= times[0] {
             return Moment::START;
         }
         let state = times.partition_point(|&t| t <= seconds).min(times.len() - 1) - 1;

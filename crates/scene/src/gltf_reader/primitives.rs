@@ -217,8 +217,7 @@ pub fn collect(
     for instance in &mut instances {
         let center = centers[instance.body as usize];
         if center != DVec3::ZERO {
-            instance.world_from_mesh =
-                instance.world_from_mesh * DAffine3::from_translation(center);
+            instance.world_from_mesh *= DAffine3::from_translation(center);
         }
     }
     move_instances(&mut instances, placed, &out.key_times, &mut warnings)?;

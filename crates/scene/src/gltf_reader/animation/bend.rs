@@ -17,7 +17,10 @@
 //! allowed error at all times: the path through the samples and the straight one are both straight
 //! between samples, and their distance, a convex function, is largest at one.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use glam::{DAffine3, DVec3};
+use rayon::prelude::*;
 use sightline_geometry::motion::lerp_transform;
 
 use super::{
@@ -32,6 +35,9 @@ const SAMPLED: f64 = 0.25;
 
 /// Most samples of all movers together: 8 bytes each, and some microseconds of time.
 const SAMPLES_MAX: u64 = 1 << 23;
+
+/// Most transforms that are kept rather than found again: 200 MB of them.
+const KEPT_MAX: usize = 1 << 21;
 
 /// What carries the points of a mover.
 #[derive(Clone, Copy, Debug)]
@@ -70,12 +76,22 @@ struct Pose {
     seconds: f64,
 }
 
-/// A mover and the times at which it has to be looked at.
+/// Movers, and the times at which they have to be looked at.
 #[derive(Debug)]
-pub struct Sampled {
-    mover: Mover,
-    /// Ascending, from 0 to the end of the animation.
-    pub times: Vec<f64>,
+pub struct Sampled<'a> {
+    rig: &'a Rig,
+    movers: Vec<Mover>,
+    /// A list a mover, ascending, from 0 to the end of the animation.
+    samples: Vec<Vec<f64>>,
+    /// All samples, ascending.
+    times: Vec<f64>,
+    /// Nodes that carry movers, without repetition, and a number in it for each mover that has one.
+    nodes: Vec<u32>,
+    slots: Vec<Option<usize>>,
+    /// World from node at all times, `time * nodes + node`; empty where that takes too much.
+    kept: Vec<DAffine3>,
+    /// The mover that was last too far from straight: it is likely to be so again.
+    worst: AtomicUsize,
 }
 
 fn longest(vectors: impl Iterator<Item = DVec3>) -> f64 {
@@ -83,28 +99,19 @@ fn longest(vectors: impl Iterator<Item = DVec3>) -> f64 {
 }
 
 impl Mover {
-    fn pose(&self, rig: &Rig, seconds: f64) -> Pose {
-        let world = match self.part {
-            Part::Node(node) => rig.world_from_node(node, seconds),
-            Part::Rests(world) => world,
-        };
-        Pose { world, seconds }
-    }
-
     fn weight(&self, term: &Term, seconds: f64) -> f64 {
         self.weights.as_ref().map_or(0.0, |w| w.number(term.target, seconds))
     }
 
     /// How far a point can be from the straight way between two key frames, metres; NaN where
     /// numbers overflow.
-    fn error(&self, rig: &Rig, a: &Pose, b: &Pose, seconds: f64) -> f64 {
-        let s = (seconds - a.seconds) / (b.seconds - a.seconds);
-        let at = self.pose(rig, seconds);
+    fn error(&self, a: &Pose, b: &Pose, at: &Pose) -> f64 {
+        let s = (at.seconds - a.seconds) / (b.seconds - a.seconds);
         let drawn = lerp_transform(&a.world, &b.world, s);
         let off = |c: &DVec3| drawn.transform_point3(*c) - at.world.transform_point3(*c);
         let mut error = longest(self.base.iter().map(off));
         for term in &self.terms {
-            let [wa, wb, w] = [a.seconds, b.seconds, seconds].map(|t| self.weight(term, t));
+            let [wa, wb, w] = [a.seconds, b.seconds, at.seconds].map(|t| self.weight(term, t));
             let map =
                 (1.0 - s) * wa * a.world.matrix3 + s * wb * b.world.matrix3 - w * at.world.matrix3;
             error += longest(term.corners.iter().map(|c| map * *c));
@@ -134,6 +141,42 @@ impl Mover {
         second * self.stretch
     }
 
+    /// The times at which it must be looked at, ascending; as many are taken from `left`.
+    fn samples(
+        &self,
+        rig: &Rig,
+        duration: f64,
+        error: f64,
+        left: &mut u64,
+    ) -> Result<Vec<f64>, SceneError> {
+        let mut keys = vec![0.0, duration];
+        if let Part::Node(node) = self.part {
+            rig.key_times(node, &mut keys);
+        }
+        keys.extend(self.weights.iter().flat_map(|w| w.times()));
+        keys.retain(|&t| t <= duration);
+        sort(&mut keys);
+        let mut samples = vec![0.0];
+        for pair in keys.windows(2) {
+            let (from, to) = (pair[0], pair[1]);
+            let bend = self.bend(rig, from, to);
+            // r h^2 / 8 <= share * error for parts of the length h. Halves of halves, so that
+            // movers share their samples.
+            let parts = (to - from) * (bend / (8.0 * SAMPLED * error)).sqrt();
+            if parts.is_nan() || parts > *left as f64 {
+                return Err(Cause::TooManySamples { error, limit: SAMPLES_MAX }.into());
+            }
+            let parts = (parts.ceil() as u64).max(1).next_power_of_two();
+            *left = left.saturating_sub(parts);
+            let share = |i: u64| i as f64 / parts as f64;
+            samples.extend((1..parts).map(|i| from + (to - from) * share(i)));
+            samples.push(to);
+        }
+        // Parts shorter than the spacing of numbers fall together.
+        samples.dedup();
+        Ok(samples)
+    }
+
     /// The times at which it jumps, seconds.
     pub fn jumps(&self, rig: &Rig, times: &mut Vec<f64>) {
         if let Part::Node(node) = self.part {
@@ -143,57 +186,98 @@ impl Mover {
     }
 }
 
-/// Finds the samples of movers over `0..=duration` for an allowed error, metres.
-pub fn sample(
-    rig: &Rig,
-    movers: Vec<Mover>,
-    duration: f64,
-    error: f64,
-) -> Result<Vec<Sampled>, SceneError> {
-    let mut left = SAMPLES_MAX;
-    let mut out = Vec::with_capacity(movers.len());
-    for mover in movers {
-        let mut keys = vec![0.0, duration];
-        if let Part::Node(node) = mover.part {
-            rig.key_times(node, &mut keys);
+impl<'a> Sampled<'a> {
+    /// Finds the samples of movers over `0..=duration` for an allowed error, metres.
+    pub fn new(
+        rig: &'a Rig,
+        movers: Vec<Mover>,
+        duration: f64,
+        error: f64,
+    ) -> Result<Self, SceneError> {
+        let mut left = SAMPLES_MAX;
+        let mut samples = Vec::with_capacity(movers.len());
+        for mover in &movers {
+            samples.push(mover.samples(rig, duration, error, &mut left)?);
         }
-        keys.extend(mover.weights.iter().flat_map(|w| w.times()));
-        keys.retain(|&t| t <= duration);
-        keys.sort_unstable_by(f64::total_cmp);
-        keys.dedup();
-        let mut times = vec![0.0];
-        for pair in keys.windows(2) {
-            let (from, to) = (pair[0], pair[1]);
-            let bend = mover.bend(rig, from, to);
-            // r h^2 / 8 <= share * error for parts of the length h.
-            let parts = ((to - from) * (bend / (8.0 * SAMPLED * error)).sqrt()).ceil().max(1.0);
-            // Also refuses NaN.
-            if !(parts <= left as f64) {
-                return Err(Cause::TooManySamples { error, limit: SAMPLES_MAX }.into());
+        let mut times = vec![];
+        for samples in &samples {
+            times.extend_from_slice(samples);
+            // Most movers share most of theirs.
+            if times.len() > 4 * TIMES_AT_ONCE {
+                sort(&mut times);
             }
-            left -= parts as u64;
-            times.extend((1..parts as u64).map(|i| from + (to - from) * (i as f64 / parts)));
-            times.push(to);
         }
-        // Parts shorter than the spacing of numbers fall together.
-        times.dedup();
-        out.push(Sampled { mover, times });
+        sort(&mut times);
+        let carrier = |m: &Mover| if let Part::Node(node) = m.part { Some(node) } else { None };
+        let mut nodes: Vec<u32> = movers.iter().filter_map(carrier).collect();
+        nodes.sort_unstable();
+        nodes.dedup();
+        let slots =
+            movers.iter().map(|m| nodes.binary_search(&carrier(m)?).ok()).collect::<Vec<_>>();
+        let kept = match nodes.len().saturating_mul(times.len()) <= KEPT_MAX {
+            true => times.par_iter().flat_map_iter(|&t| rig.world_from_nodes(&nodes, t)).collect(),
+            false => vec![],
+        };
+        let worst = AtomicUsize::new(0);
+        Ok(Self { rig, movers, samples, times, nodes, slots, kept, worst })
     }
-    Ok(out)
-}
 
-impl Sampled {
-    /// True when it may be drawn straight between two key frames.
-    pub fn is_straight(&self, rig: &Rig, from: f64, to: f64, error: f64) -> bool {
-        let first = self.times.partition_point(|&t| t <= from);
-        let end = self.times.partition_point(|&t| t < to);
+    /// All samples, ascending.
+    pub fn times(&self) -> &[f64] {
+        &self.times
+    }
+
+    /// True when all movers may be drawn straight between two key frames.
+    pub fn are_straight(&self, from: f64, to: f64, error: f64) -> bool {
+        let worst = self.worst.load(Ordering::Relaxed);
+        // Which one is remembered changes how long this takes, not what it finds.
+        self.is_straight(worst, from, to, error)
+            && (0..self.movers.len()).into_par_iter().all(|m| {
+                let straight = self.is_straight(m, from, to, error);
+                if !straight {
+                    self.worst.store(m, Ordering::Relaxed);
+                }
+                straight
+            })
+    }
+
+    fn is_straight(&self, mover: usize, from: f64, to: f64, error: f64) -> bool {
+        let samples = &self.samples[mover];
+        let first = samples.partition_point(|&t| t <= from);
+        let end = samples.partition_point(|&t| t < to);
         if first >= end {
             return true;
         }
-        let (a, b) = (self.mover.pose(rig, from), self.mover.pose(rig, to));
-        let straight = |&t: &f64| self.mover.error(rig, &a, &b, t) <= (1.0 - SAMPLED) * error;
+        let (a, b) = (self.pose(mover, from), self.pose(mover, to));
+        let straight = |&t: &f64| {
+            let off = self.movers[mover].error(&a, &b, &self.pose(mover, t));
+            off <= (1.0 - SAMPLED) * error
+        };
         // What fails does so in the middle, mostly.
-        let inside = &self.times[first..end];
+        let inside = &samples[first..end];
         straight(&inside[inside.len() / 2]) && inside.iter().all(straight)
     }
+
+    fn pose(&self, mover: usize, seconds: f64) -> Pose {
+        let world = match (self.movers[mover].part, self.slots[mover]) {
+            (Part::Rests(world), _) => world,
+            (Part::Node(node), slot) => {
+                let kept = slot.filter(|_| !self.kept.is_empty()).and_then(|slot| {
+                    let time = self.times.binary_search_by(|t| t.total_cmp(&seconds)).ok()?;
+                    Some(self.kept[time * self.nodes.len() + slot])
+                });
+                kept.unwrap_or_else(|| self.rig.world_from_node(node, seconds))
+            }
+        };
+        Pose { world, seconds }
+    }
+}
+
+/// Times that are gathered before those that are equal are dropped.
+pub const TIMES_AT_ONCE: usize = 1 << 20;
+
+/// Puts times in order and drops equal ones.
+pub fn sort(times: &mut Vec<f64>) {
+    times.sort_unstable_by(f64::total_cmp);
+    times.dedup();
 }

@@ -22,14 +22,16 @@ use sightline_geometry::Bounds;
 pub struct Soft {
     /// Vertices at rest, without the displacements of `targets`; each is used by a triangle.
     pub positions: Vec<[f32; 3]>,
-    /// Displacements by morph targets whose weights change, by number of the target: vertices and
-    /// how far, without those that stay.
-    pub targets: Vec<(usize, Vec<(u32, [f32; 3])>)>,
+    /// Displacements by morph targets whose weights change, by number of the target.
+    pub targets: Vec<(usize, Displacements)>,
     /// Weights of the morph targets, where they change.
     pub weights: Option<Sampler>,
     /// The skin, and which of its joints each vertex follows.
     pub skin: Option<(Arc<Skin>, Influences)>,
 }
+
+/// Vertices that a morph target moves, and how far.
+pub type Displacements = Vec<(u32, [f32; 3])>;
 
 fn wide(p: [f32; 3]) -> DVec3 {
     DVec3::from_array(p.map(f64::from))
@@ -184,10 +186,10 @@ impl Soft {
 
 /// World, relative to `center`, from mesh for each joint.
 fn joint_maps(rig: &Rig, skin: &Skin, center: DVec3, seconds: f64) -> Vec<DAffine3> {
-    let map = |(&joint, joint_from_mesh): (&u32, &DAffine3)| {
-        let mut world = rig.world_from_node(joint, seconds);
+    let world_from_joints = rig.world_from_nodes(&skin.joints, seconds);
+    let map = |(mut world, joint_from_mesh): (DAffine3, &DAffine3)| {
         world.translation -= center;
         world * *joint_from_mesh
     };
-    skin.joints.iter().zip(&skin.joint_from_mesh).map(map).collect()
+    world_from_joints.into_iter().zip(&skin.joint_from_mesh).map(map).collect()
 }

@@ -10,10 +10,8 @@
 //! spacing of `f32` numbers at t, whichever is more, but at most half of the time since the jump
 //! before. Within it nothing is promised.
 
-use rayon::prelude::*;
-
 use super::{
-    bend::{self, Mover},
+    bend::{Mover, Sampled, TIMES_AT_ONCE, sort},
     rig::Rig,
 };
 use crate::{Cause, OpenOptions, SceneError};
@@ -45,27 +43,18 @@ pub fn choose(
     let mut jumps = vec![];
     for mover in &movers {
         mover.jumps(rig, &mut jumps);
-        if jumps.len() > JUMPS_AT_ONCE {
+        if jumps.len() > TIMES_AT_ONCE {
             sort(&mut jumps);
         }
     }
     sort(&mut jumps);
     jumps.retain(|&t| t > 0.0 && t <= duration);
-    let movers = bend::sample(rig, movers, duration, error)?;
-    let mut candidates: Vec<f64> = vec![];
-    for mover in &movers {
-        candidates.extend_from_slice(&mover.times);
-        if candidates.len() > 4 * mover.times.len() + JUMPS_AT_ONCE {
-            sort(&mut candidates);
-        }
-    }
-    sort(&mut candidates);
+    let movers = Sampled::new(rig, movers, duration, error)?;
+    let candidates = movers.times();
 
     let too_many = |reached: f64| -> SceneError {
         Cause::TooManyStates { error, limit: options.max_states, reached, duration }.into()
     };
-    let straight =
-        |from: f64, to: f64| movers.par_iter().all(|m| m.is_straight(rig, from, to, error));
     let add = |times: &mut Vec<f64>, time: f64| {
         if times.len() > options.max_states as usize {
             return Err(too_many(times[times.len() - 1]));
@@ -83,7 +72,7 @@ pub fn choose(
             let first = candidates.partition_point(|&t| t <= from);
             let last = candidates.partition_point(|&t| t < end);
             let at = |i: usize| if i < last { candidates[i] } else { end };
-            let next = farthest(first, last, stride, |i| straight(from, at(i)));
+            let next = farthest(first, last, stride, |i| movers.are_straight(from, at(i), error));
             stride = next + 1 - first;
             add(times, at(next))?;
         }
@@ -102,14 +91,6 @@ pub fn choose(
     }
     walk(&mut times, duration)?;
     Ok(KeyFrames { times, jumps: jumps.len() as u64 })
-}
-
-/// Times that are gathered before those that are equal are dropped.
-const JUMPS_AT_ONCE: usize = 1 << 20;
-
-fn sort(times: &mut Vec<f64>) {
-    times.sort_unstable_by(f64::total_cmp);
-    times.dedup();
 }
 
 /// The jump before another one; 0 before the first.

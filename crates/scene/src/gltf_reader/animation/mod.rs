@@ -95,11 +95,6 @@ impl NodeTracks {
     pub fn moves(&self) -> bool {
         self.transform().any(|s| !s.is_constant())
     }
-
-    /// The weights of its morph targets, where they change over time.
-    pub fn moving_weights(&self) -> Option<&Sampler> {
-        self.get(Property::Weights).filter(|s| !s.is_constant())
-    }
 }
 
 /// What moves the scene.

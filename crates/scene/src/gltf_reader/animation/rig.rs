@@ -142,16 +142,51 @@ impl Rig {
 
     /// World from node at a time; the identity for nodes that have not been added.
     pub fn world_from_node(&self, node: u32, seconds: f64) -> DAffine3 {
-        let mut below = DAffine3::IDENTITY;
+        // Multiplied from the root down, as for nodes at rest.
+        let mut path = vec![];
         let mut at = node;
-        while let Some((parent, local)) = self.moving.get(&at) {
-            below = local.at(seconds) * below;
+        let mut world = loop {
+            let Some((parent, local)) = self.moving.get(&at) else {
+                break self.resting.get(&at).copied().unwrap_or(DAffine3::IDENTITY);
+            };
+            path.push(local);
             match parent {
                 Parent::Moves(parent) => at = *parent,
-                Parent::Rests(world_from_parent) => return *world_from_parent * below,
+                Parent::Rests(world_from_parent) => break *world_from_parent,
             }
+        };
+        while let Some(local) = path.pop() {
+            world *= local.at(seconds);
         }
-        self.resting.get(&node).copied().unwrap_or(DAffine3::IDENTITY)
+        world
+    }
+
+    /// World from node at a time for several nodes, whose ancestors are looked at once.
+    pub fn world_from_nodes(&self, nodes: &[u32], seconds: f64) -> Vec<DAffine3> {
+        let mut known: HashMap<u32, DAffine3> = HashMap::new();
+        let mut path = vec![];
+        let mut world_from_node = |node: u32| {
+            let mut at = node;
+            let mut world = loop {
+                if let Some(world) = known.get(&at) {
+                    break *world;
+                }
+                let Some((parent, local)) = self.moving.get(&at) else {
+                    break self.world_from_node(at, seconds);
+                };
+                path.push((at, local));
+                match parent {
+                    Parent::Moves(parent) => at = *parent,
+                    Parent::Rests(world_from_parent) => break *world_from_parent,
+                }
+            };
+            while let Some((node, local)) = path.pop() {
+                world *= local.at(seconds);
+                known.insert(node, world);
+            }
+            world
+        };
+        nodes.iter().map(|&node| world_from_node(node)).collect()
     }
 
     /// Bounds of a point of a node as it moves in the world, from those of the point in the node,

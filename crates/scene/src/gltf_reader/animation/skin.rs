@@ -187,7 +187,7 @@ impl Influences {
                     let (joint, weight) = (follows[k] as u32, weights[k]);
                     // A joint of weight zero may be anything.
                     let exists = (joint as usize) < joints || weight == 0.0;
-                    if !exists || !(weight >= 0.0 && weight.is_finite()) {
+                    if !(exists && weight >= 0.0 && weight.is_finite()) {
                         let (vertex, joints) = (number, joints as u64);
                         return Err(Cause::VertexJoint { vertex, joint, weight, joints }.into());
                     }
