@@ -303,3 +303,107 @@ fn slerp(from: DQuat, to: DQuat, u: f64) -> DQuat {
     };
     (from * x + to * (sign * y)).normalize()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn sampler(
+        interpolation: Interpolation,
+        width: usize,
+        times: &[f64],
+        values: &[f32],
+    ) -> Sampler {
+        Sampler::new(interpolation, width, times.into(), values.into())
+    }
+
+    #[test]
+    fn steps_hold_the_value_of_the_key_before() {
+        let s = sampler(Interpolation::Step, 1, &[1.0, 2.0, 4.0], &[5.0, 6.0, 6.0]);
+        for (seconds, value) in [(0.0, 5.0), (1.0, 5.0), (1.999, 5.0), (2.0, 6.0), (9.0, 6.0)] {
+            assert_eq!(s.number(0, seconds), value, "{seconds}");
+        }
+        assert_eq!(s.jumps().collect::<Vec<_>>(), [2.0]);
+        assert!(!s.is_constant());
+    }
+
+    #[test]
+    fn lines_join_the_keys_and_hold_behind_them() {
+        let s = sampler(Interpolation::Linear, 2, &[1.0, 3.0], &[0.0, 10.0, 4.0, -10.0]);
+        assert_eq!(s.vector::<2>(0.5), [0.0, 10.0]);
+        assert_eq!(s.vector::<2>(1.5), [1.0, 5.0]);
+        assert_eq!(s.vector::<2>(3.5), [4.0, -10.0]);
+        assert_eq!(s.jet(0..1, 1.0, 3.0), Jet { value: 4.0, first: 2.0, second: 0.0 });
+        assert_eq!(s.jet(0..1, 3.0, 4.0), Jet::constant(4.0));
+    }
+
+    #[test]
+    fn splines_are_hermite_curves() {
+        // In-tangent, value, out-tangent: from 1 with slope 3 to 2 with slope -1, over 2 s.
+        let s =
+            sampler(Interpolation::CubicSpline, 1, &[0.0, 2.0], &[9.0, 1.0, 3.0, -1.0, 2.0, 9.0]);
+        // u = 1/2: 1/2 1 + 2/8 3 + 1/2 2 - 2/8 (-1).
+        assert_eq!(s.number(0, 1.0), 2.5);
+        assert_eq!((s.number(0, 0.0), s.number(0, 2.0)), (1.0, 2.0));
+        let slope = (s.number(0, 1e-6) - 1.0) / 1e-6;
+        assert!((slope - 3.0).abs() < 1e-4, "{slope}");
+    }
+
+    #[test]
+    fn opposite_quaternions_are_the_same_rotation() {
+        let s = sampler(
+            Interpolation::Linear,
+            4,
+            &[0.0, 1.0],
+            &[0.0, 0.0, 0.0, 2.0, 0.0, 0.0, -0.6, -0.8],
+        );
+        let half = s.rotation(0.5);
+        // A third of the way by angle is the cosine of half of it.
+        let expected = DQuat::from_xyzw(0.0, 0.0, 0.6, 0.8);
+        assert!(half.dot(expected) > 0.9 && (half * half).dot(expected).abs() > 1.0 - 1e-7);
+        assert!((s.rotation(0.0).w - 1.0).abs() < 1e-15);
+    }
+
+    #[test]
+    fn a_spline_through_zero_still_gives_a_rotation() {
+        let values = [
+            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, //
+            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0,
+        ];
+        let s = sampler(Interpolation::CubicSpline, 4, &[0.0, 1.0], &values);
+        assert!((0..=100).all(|i| s.rotation(f64::from(i) / 100.0).is_finite()));
+        assert!(!s.rotation_jet(0.0, 1.0).second.is_finite());
+    }
+
+    proptest! {
+        /// Against differences of values: the bounds hold.
+        #[test]
+        fn jets_bound_value_and_derivatives(
+            values in prop::collection::vec(-2.0f32..2.0, 24),
+            spline in any::<bool>(),
+            at in 0.01..0.98f64,
+        ) {
+            let mode = if spline { Interpolation::CubicSpline } else { Interpolation::Linear };
+            let mut values = values[..if spline { 24 } else { 8 }].to_vec();
+            for k in 0..2 {
+                values[if spline { 12 * k + 7 } else { 4 * k + 3 }] = 3.0;
+            }
+            let s = sampler(mode, 4, &[0.0, 1.0], &values);
+            let h = 1e-3;
+            let derivatives = |f: &dyn Fn(f64) -> DVec4| {
+                let (a, b, c) = (f(at), f(at + h), f(at + 2.0 * h));
+                (b.length(), (c - a).length() / (2.0 * h), (a - 2.0 * b + c).length() / (h * h))
+            };
+            let jet = s.jet(0..4, 0.0, 1.0);
+            let (value, first, second) = derivatives(&|t| DVec4::from_array(s.vector(t)));
+            prop_assert!(value <= jet.value + 1e-9 && first <= jet.first + 1e-6);
+            prop_assert!(second <= jet.second + 1e-4, "{second} > {}", jet.second);
+            let turn = s.rotation_jet(0.0, 1.0);
+            let (_, first, second) =
+                derivatives(&|t| (s.rotation(t) * glam::DVec3::new(0.6, 0.0, 0.8)).extend(0.0));
+            prop_assert!(first <= turn.first + 1e-6, "{first} > {}", turn.first);
+            prop_assert!(second <= turn.second + 1e-4, "{second} > {}", turn.second);
+        }
+    }
+}
