@@ -3,14 +3,18 @@
 //! [`export_visible`] promises: the file holds the triangles of the set and no others, with their vertex
 //! attributes (in the component types of the source), materials, textures, names, hierarchy, extras,
 //! cameras and lights, in standard glTF 2.0 that passes the Khronos validator when the source does.
-//! External and data-URI images are embedded. The bytes depend on source and set alone.
+//! External and data-URI images are embedded. The bytes depend on source, set and moment alone.
 //!
-//! Particles of the set are instances of a tessellated sphere, where they are at the first key frame. A
-//! scene of particles alone is exported as these.
+//! Particles of the set are instances of a tessellated sphere. A scene of particles alone is exported as
+//! these.
 //!
-//! Left out: animations, skins (a skinned mesh stands where the reader saw it), morph targets
-//! (their weights at rest are applied to positions), other scenes than the default one, and what
-//! nothing visible refers to. Compressed data is written decompressed; strips and fans become lists.
+//! The file is at rest: what an animation or a skin places is frozen at one moment, by default the first
+//! key frame. Such a mesh becomes a root with positions of its own, since between two key frames
+//! its transform need not be one that glTF can state. Cameras and lights stand where the nodes of
+//! the source put them.
+//!
+//! Left out: animations, skins and morph targets, once they are applied to positions; normals of
+//! what bends; other scenes than the default one, and what nothing visible refers to. Compressed data is written decompressed; strips and fans become lists.
 //! What is lost that way is a warning of the report.
 //!
 //! How a visible subset maps to meshes: the visible triangles of every instance of the geometry are a
@@ -19,9 +23,10 @@
 //! one child a distinct mesh, instanced where several instances share it.
 //!
 //! Parts: `source` reads raw elements; `output` collects sections, accessors and the GLB
-//! container; `subset` finds subsets and rebuilds primitives; `appearance` follows materials to images.
+//! container; `subset` finds subsets and rebuilds primitives, `frozen` those that move; `appearance` follows materials to images.
 
 mod appearance;
+mod frozen;
 mod hierarchy;
 mod output;
 mod particles;
@@ -64,6 +69,22 @@ pub struct ExportReport {
     pub warnings: Vec<String>,
 }
 
+/// How a set is to be exported.
+#[derive(Clone, Copy, Debug, Default)]
+#[non_exhaustive]
+pub struct ExportOptions {
+    /// The moment at which what moves is frozen; the first key frame without one.
+    pub moment: Option<Moment>,
+}
+
+impl ExportOptions {
+    /// Freezes what moves at a moment of the scene, see [`Scene::moment_at`].
+    #[must_use]
+    pub fn at(moment: Moment) -> Self {
+        Self { moment: Some(moment) }
+    }
+}
+
 /// Why a set was not exported.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -92,6 +113,16 @@ pub enum ExportError {
         primitive: u32,
         /// Primitives of the scene.
         count: u32,
+    },
+    /// The scene has no such moment.
+    #[error("the scene has {states} states, there is no moment {t} of state {state}")]
+    NoSuchMoment {
+        /// State of the moment.
+        state: u32,
+        /// Its share of the state.
+        t: f64,
+        /// States of the scene.
+        states: u32,
     },
     /// The output would replace the source: choose another path.
     #[error("{} is the source of the export", file.display())]
@@ -140,7 +171,8 @@ const NO_TRIANGLES: &[u8] = br#"{ "asset": { "version": "2.0" }, "scene": 0, "sc
 const ROOT_EXTENSIONS: [&str; 3] = ["KHR_lights_punctual", "KHR_xmp_json_ld", "KHR_xmp"];
 
 /// Writes the part of `scene` that is in `set` to `out`, a GLB file. `source` is the file that
-/// the scene was read from. `out` is replaced only when everything is written.
+/// the scene was read from. `out` is replaced only when everything is written. What moves stands as
+/// at the first key frame.
 ///
 /// # Errors
 /// See [`ExportError`].
@@ -150,6 +182,25 @@ pub fn export_visible(
     set: &PrimitiveSet,
     out: &Path,
 ) -> Result<ExportReport, ExportError> {
+    export_visible_with(source, scene, set, ExportOptions::default(), out)
+}
+
+/// As [`export_visible`], with options.
+///
+/// # Errors
+/// See [`ExportError`].
+pub fn export_visible_with(
+    source: &Path,
+    scene: &Scene,
+    set: &PrimitiveSet,
+    options: ExportOptions,
+    out: &Path,
+) -> Result<ExportReport, ExportError> {
+    let moment = options.moment.unwrap_or(Moment::START);
+    let states = scene.geometry.states;
+    if moment.state >= states || !(0.0..=1.0).contains(&moment.t) {
+        return Err(ExportError::NoSuchMoment { state: moment.state, t: moment.t, states });
+    }
     let count = scene.geometry.primitive_count();
     if let Some(last) = set.runs().last().filter(|r| r.end > count) {
         return Err(ExportError::NotThisScene { primitive: last.end - 1, count });
@@ -183,12 +234,11 @@ pub fn export_visible(
     let mut output = Output::default();
     let mut warnings = Warnings::default();
     let placed = subset::placed(scene, set);
-    let mut meshes = subset::Meshes::new(&read, scene);
+    let mut meshes = subset::Meshes::new(&read, scene, moment);
     let mut nodes = hierarchy::build(&read, &placed, &mut meshes, &mut output, &mut warnings)
         .ok_or_else(|| malformed("its nodes or meshes are not as they were read".into()))?;
-    let balls =
-        particles::balls(scene, set, Moment::START, meshes.json.len(), &mut output, &mut warnings)
-            .ok_or_else(|| malformed("its particles are not as they were read".into()))?;
+    let balls = particles::balls(scene, set, moment, meshes.json.len(), &mut output, &mut warnings)
+        .ok_or_else(|| malformed("its particles are not as they were read".into()))?;
     nodes.roots.extend(nodes.json.len()..nodes.json.len() + balls.nodes.len());
     nodes.json.extend(balls.nodes);
     meshes.json.extend(balls.mesh);

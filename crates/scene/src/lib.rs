@@ -21,5 +21,5 @@ pub use digest::{FileDigest, SceneDigest, digest, digest_with};
 pub use error::{Cause, Place, SceneError, UriProblem};
 pub use numbering::morton;
 pub use particles::{ParticleSource, TableProblem};
-pub use report::{DegenerateTriangles, IngestReport, SkippedPrimitives};
-pub use scene::{InstanceSource, MeshSource, Object, OpenOptions, Scene};
+pub use report::{DegenerateTriangles, IgnoredChannels, IngestReport, SkippedPrimitives};
+pub use scene::{AnimationChoice, InstanceSource, MeshSource, Object, OpenOptions, Scene};

@@ -30,6 +30,17 @@ pub struct SkippedPrimitives {
     pub without_positions: u64,
 }
 
+/// Channels of the animation that were not followed, for one reason.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct IgnoredChannels {
+    /// Why.
+    pub reason: String,
+    /// How many there are.
+    pub count: u64,
+    /// Which is the first: animation, channel and what it moves.
+    pub first: String,
+}
+
 /// What reading a scene found.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct IngestReport {
@@ -63,11 +74,27 @@ pub struct IngestReport {
     pub skipped: SkippedPrimitives,
     /// Nodes with a mesh that are switched off by KHR_node_visibility, or lie below such a node.
     pub hidden_nodes: u64,
-    /// True when the file animates anything; the scene is read at rest.
+    /// True when the file animates anything, whether or not the scene is read in motion.
     pub animated: bool,
     /// Number of animations in the file.
     pub animations: u64,
-    /// Objects with a skin; they are read in the pose that the file stores.
+    /// Their names; `#` and the index for those without.
+    pub animation_names: Vec<String>,
+    /// Names of those that move the scene.
+    pub animations_taken: Vec<String>,
+    /// The time of their last key, seconds.
+    pub duration_s: f64,
+    /// Number of states: 1 at rest.
+    pub states: u64,
+    /// Objects with something that moves.
+    pub moving_objects: u64,
+    /// Instanced triangles that move.
+    pub moving_triangles: u64,
+    /// Channels that were not followed.
+    pub ignored_channels: Vec<IgnoredChannels>,
+    /// Times at which something jumps. A jump is a state of its own, of a millisecond.
+    pub jumps: u64,
+    /// Objects with a skin.
     pub skinned_objects: u64,
     /// Instances that a scale of zero flattens; their triangles were flattened one by one.
     pub flattened_instances: u64,

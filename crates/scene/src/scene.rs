@@ -7,16 +7,18 @@
 //! - every object has at least one primitive;
 //! - `meshes` is parallel to `geometry.meshes`, `instances` to `geometry.instances`, `particles` to
 //!   `geometry.particles`;
-//! - `key_times` ascends, and has one entry more than there are states, or one for a scene at rest;
 //! - every mesh has at least one triangle and one instance, and only vertices that a triangle
-//!   uses, in the order in which the hierarchy's triangles use them.
+//!   uses, in the order in which the hierarchy's triangles use them;
+//! - key times ascend, and there is one more than there are states; a scene at rest has one, and one
+//!   state;
+//! - what has a value a key frame is not the same at all of them.
 
 use std::{
     ops::Range,
     path::{Path, PathBuf},
 };
 
-use sightline_geometry::{Bounds, InstancedGeometry, ObjectId};
+use sightline_geometry::{Bounds, Bounds32, InstancedGeometry, Moment, ObjectId};
 
 use crate::{IngestReport, ParticleSource, SceneDigest, SceneError, gltf_reader, particles};
 
@@ -37,10 +39,23 @@ pub struct OpenOptions {
     /// Refuse scenes whose particle tables have more spheres than this: particles times key
     /// frames, all tables together. A sphere takes 16 bytes.
     pub max_spheres: u64,
+    /// Which animation moves the scene.
+    pub animation: AnimationChoice,
+    /// Between two key frames every vertex moves linearly; no vertex is then farther than this from
+    /// where the animation puts it, at any time but within the short states of jumps. Metres, above
+    /// 0.
+    pub motion_error: f64,
+    /// Refuse animations that need more states than this.
+    pub max_states: u32,
+    /// Refuse scenes that would keep more positions of moving things than this: vertices that move
+    /// on their own and corners of the boxes of moving instances, once a key frame. A position takes
+    /// 12 bytes.
+    pub max_moving_positions: u64,
 }
 
 impl Default for OpenOptions {
-    /// No see-through patterns, 2^28 unique triangles, 2^24 instances, no tables, 2^28 spheres.
+    /// No see-through patterns, 2^28 unique triangles, 2^24 instances; no tables, 2^28 spheres; the
+    /// first animation within 0.01 m, 4096 states, 2^28 moving positions.
     fn default() -> Self {
         Self {
             see_through: Vec::new(),
@@ -48,8 +63,29 @@ impl Default for OpenOptions {
             max_instances: 1 << 24,
             particles: Vec::new(),
             max_spheres: 1 << 28,
+            animation: AnimationChoice::First,
+            motion_error: 0.01,
+            max_states: 4096,
+            max_moving_positions: 1 << 28,
         }
     }
+}
+
+/// Which of a file's animations moves the scene. After its last key a channel holds its value, and so
+/// it does before its first.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum AnimationChoice {
+    /// The first one; none where the file has none.
+    #[default]
+    First,
+    /// None: the scene is at rest, in the pose of its nodes.
+    None,
+    /// All of them, started together. Two that move the same property of a node are refused.
+    All,
+    /// The one with this index into `animations`.
+    Index(u32),
+    /// The first one with this name.
+    Name(String),
 }
 
 /// What the author named: a node with at least one triangle, or a particle table.
@@ -94,6 +130,9 @@ pub struct InstanceSource {
     pub gpu_instance: Option<u32>,
     /// Index into the `primitives` of the node's mesh.
     pub primitive: u32,
+    /// True when an animation or a skin may place it, so that the nodes of the file and their weights
+    /// alone do not say where it is.
+    pub posed: bool,
     /// True when the material shows the back of its triangles: seeing a back does not mean
     /// being inside.
     pub double_sided: bool,
@@ -112,8 +151,8 @@ pub struct Scene {
     pub instances: Vec<InstanceSource>,
     /// Parallel to the particle systems of `geometry`.
     pub particles: Vec<ParticleSource>,
-    /// Times of the key frames, seconds, ascending: one more than there are states; a single one
-    /// for a scene at rest.
+    /// Times of the key frames, seconds, ascending; those of an animation start at 0. One more than
+    /// the geometry has states; a single one for a scene at rest, which has one state.
     pub key_times: Vec<f64>,
     /// What reading found.
     pub report: IngestReport,
@@ -122,8 +161,8 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Reads a `.gltf` or `.glb` file: the default scene, at rest; or a `.parquet` or `.csv` table of
-    /// particles. The tables of the options are added.
+    /// Reads a `.gltf` or `.glb` file: the default scene, moved by the animation that the options
+    /// choose; or a `.parquet` or `.csv` table of particles. The tables of the options are added.
     ///
     /// # Errors
     /// When a file cannot be read, breaks a rule of its format that the geometry depends on, or is
@@ -151,6 +190,26 @@ impl Scene {
         read.map_err(|e| e.in_file(path))
     }
 
+    /// The moment at a time in seconds; times before the first key frame are taken for it, times
+    /// after the last one for that. A key frame is the beginning of the state that it starts.
+    #[must_use]
+    pub fn moment_at(&self, seconds: f64) -> Moment {
+        let times = &self.key_times;
+        if times.len() < 2 || seconds.is_nan() || seconds <= times[0] {
+            return Moment::START;
+        }
+        let state = times.partition_point(|&t| t <= seconds).min(times.len() - 1) - 1;
+        let (from, to) = (times[state], times[state + 1]);
+        Moment { state: state as u32, t: ((seconds - from) / (to - from)).min(1.0) }
+    }
+
+    /// The time of a moment, seconds.
+    #[must_use]
+    pub fn time_of(&self, moment: Moment) -> f64 {
+        let (from, to) = sightline_geometry::motion::around(&self.key_times, moment.state);
+        (1.0 - moment.t) * from + moment.t * to
+    }
+
     /// Panics when an invariant of the module does not hold.
     pub fn assert_well_formed(&self) {
         let g = &self.geometry;
@@ -174,6 +233,7 @@ impl Scene {
             assert!(object.occluder || !instance.occluder);
         }
         assert!(placed.iter().all(|&p| p), "every mesh is placed");
+        self.assert_motion_is_well_formed();
         for (mesh, source) in g.meshes.iter().zip(&self.meshes) {
             assert_eq!(mesh.triangles.len(), source.triangles.len());
             assert!(!mesh.triangles.is_empty());
@@ -183,21 +243,51 @@ impl Scene {
                 next = next.max(v + 1);
             }
             assert_eq!(next as usize, mesh.positions.len(), "every vertex is used");
-            let boxes: Vec<_> = mesh
-                .triangles
-                .iter()
-                .map(|t| {
-                    sightline_geometry::Bounds32::of_points(t.map(|v| mesh.positions[v as usize]))
-                })
-                .collect();
-            mesh.hierarchy.assert_well_formed(&boxes);
+            let box_of = |positions: &[[f32; 3]], t: usize| {
+                Bounds32::of_points(mesh.triangles[t].map(|v| positions[v as usize]))
+            };
+            let count = mesh.triangles.len();
+            match &mesh.motion {
+                None => {
+                    let boxes: Vec<_> = (0..count).map(|t| box_of(&mesh.positions, t)).collect();
+                    mesh.hierarchy.assert_well_formed(&boxes);
+                }
+                Some(motion) => {
+                    assert!(mesh.hierarchy.nodes.is_empty(), "one hierarchy a mesh");
+                    let box_of = |t: usize, key: usize| box_of(&motion.keys[key], t);
+                    motion.hierarchy.assert_well_formed(count, box_of);
+                }
+            }
+        }
+    }
+
+    fn assert_motion_is_well_formed(&self) {
+        let (g, times) = (&self.geometry, &self.key_times);
+        assert!(times.windows(2).all(|pair| pair[0] < pair[1]), "key times ascend");
+        let keys = g.states as usize + 1;
+        if times.len() == 1 {
+            assert!(g.states == 1 && !g.has_motion(), "one key frame is of a scene at rest");
+        } else {
+            assert_eq!(times.len(), keys, "key frames and states");
+            assert!(g.has_motion(), "a scene of several key frames moves");
+        }
+        for maps in g.instances.iter().filter_map(|i| Some((i, i.motion.as_deref()?))) {
+            let (instance, maps) = maps;
+            assert_eq!(maps.len(), keys);
+            assert_eq!(maps[0], instance.world_from_mesh, "at the first key frame");
+            assert!(maps.iter().all(|m| m.is_finite()));
+        }
+        for (mesh, motion) in g.meshes.iter().filter_map(|m| Some((m, m.motion.as_ref()?))) {
+            assert_eq!(motion.keys.len(), keys);
+            assert_eq!(motion.keys[0], mesh.positions, "at the first key frame");
+            let same = |key: &Vec<[f32; 3]>| key.len() == mesh.positions.len();
+            assert!(motion.keys.iter().all(same), "every vertex has a place a key frame");
+            assert!(motion.moves.contains(&true), "what does not move has one value");
         }
     }
 
     fn assert_particles_well_formed(&self) {
         let g = &self.geometry;
-        assert!(self.key_times.is_sorted_by(|a, b| a < b), "key times ascend");
-        assert_eq!(particles::states(&self.key_times), g.states);
         assert_eq!(self.particles.len(), g.particles.len());
         let behind = self.objects.len() - self.particles.len();
         for ((system, source), object) in
