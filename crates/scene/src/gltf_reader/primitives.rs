@@ -131,7 +131,8 @@ pub struct Unique {
     pub warnings: Vec<String>,
 }
 
-/// Reads every body that the placements need, and places all at the key frames.
+/// Reads every body that the placements need, and places all at the key frames. `table_times` are the
+/// key times of the particle tables of the scene.
 pub fn collect(
     document: &Document,
     accessors: &Accessors,
