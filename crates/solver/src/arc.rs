@@ -9,11 +9,18 @@
 //!   k = d . d: seen from outside it is the smaller, a convex function of t, since the points of
 //!   (t, depth) that are inside of the ball are a convex set; from inside the larger, a concave one.
 //!
-//! An arc is held between two lines parallel to its chord, a [`Band`]. Over a stretch that is split,
-//! bands get thinner with the square of its length, so who is nearer, and where that changes, is
-//! found by splitting until bands do not overlap: [`order`]. Where depths differ by less than the
-//! rounding of both, the two are equal there; equal on all of what they share, the lower number is
-//! nearer, else what is beside it decides, as for lines.
+//! An arc is held between two lines parallel to its chord, a [`Band`]: mostly that is enough to tell who
+//! of two is nearer. Where it is not, [`order`] looks where they may change places. Depths are
+//! (A -+ sqrt(C)) / B with polynomials A, B, C (C = 0 for triangles and lines, B = 1 for spheres and lines),
+//! so that is where a polynomial changes its sign:
+//!
+//! - two triangles: N1 D2 - N2 D1, of degree 5;
+//! - a triangle and a sphere: (N - foot D)^2 - C D^2, of degree 6;
+//! - two spheres, with the distance d of their feet: (C1 - C2 - d^2)^2 - 4 d^2 C2, of degree 4.
+//!
+//! Between two such places the depths in the middle decide. Where depths differ by less than the rounding
+//! of both, the two are equal; equal on all of what they share, the lower number is nearer, else
+//! what is beside it decides, as for lines. (The source excludes spheres that cross.)
 //!
 //! Derivation of the bands. *Rational*: with the chord c(t) between the exact ends, N - c D is a cubic
 //! that is 0 at both ends, so at most 3/4 of the larger of its two inner coefficients, and |D| is at
@@ -24,7 +31,7 @@
 use sightline_geometry::UNIT_ROUNDOFF;
 
 use crate::{
-    bernstein::{cubic, cubic_on, linear, quadratic, quadratic_on},
+    bernstein::{Polynomial, cubic, cubic_on, linear, quadratic, quadratic_on},
     envelope::{Line, largest, least},
 };
 
@@ -156,8 +163,8 @@ pub struct Order {
 
 impl Order {
     /// Two rational depths cross at most five times, a sphere and such a depth six times; the rest is
-    /// room for touches that rounding breaks up.
-    pub const MOST: usize = 12;
+    /// room for what rounding breaks up.
+    pub const MOST: usize = 10;
 }
 
 /// A line or an arc.
@@ -170,13 +177,88 @@ pub struct Curve<'a> {
 }
 
 impl Curve<'_> {
-    fn band(&self, s: f64, e: f64) -> Band {
-        match self.arc {
-            Some(arc) => arc.band(s, e),
-            None => {
-                let (z0, z1) = (self.line.depth(s), self.line.depth(e));
-                Band { z0, z1, below: 0.0, above: 0.0, error: self.line.above }
+    /// Depth at `t` and its largest error, metres.
+    fn depth(&self, t: f64) -> (f64, f64) {
+        let Some(arc) = self.arc else { return (self.line.depth(t), self.line.above) };
+        let z = arc.depth(t);
+        let error = match &arc.shape {
+            Shape::Rational { d, n_error, d_error, .. } => {
+                let noise = 2.0 * (n_error + z * d_error) / quadratic(*d, t).abs();
+                // NaN, where D is 0, becomes the whole.
+                arc.error + if noise < arc.far - arc.near { noise } else { arc.far - arc.near }
             }
+            Shape::Ball { .. } => arc.error,
+        };
+        (z, error)
+    }
+
+    /// Its depth as (A -+ sqrt(C)) / B on a stretch.
+    fn on(&self, s: f64, e: f64) -> Terms {
+        let none = (Polynomial::new(&[0.0]), 0.0);
+        let one = (Polynomial::new(&[1.0]), 0.0);
+        let Some(arc) = self.arc else {
+            let a = Polynomial::new(&[self.line.depth(s), self.line.depth(e)]);
+            return Terms { a: (a, self.line.above), b: one, c: none };
+        };
+        match &arc.shape {
+            Shape::Rational { n, d, n_error, d_error } => Terms {
+                a: (Polynomial::new(&cubic_on(*n, s, e)), *n_error),
+                b: (Polynomial::new(&quadratic_on(*d, s, e)), *d_error),
+                c: none,
+            },
+            Shape::Ball { foot, g, inverse, .. } => {
+                let a = Polynomial::new(&[linear(*foot, s), linear(*foot, e)]);
+                let scale = inverse * inverse;
+                let c = quadratic_on(*g, s, e).map(|g| g * scale);
+                // The error of a depth is that of sqrt(C) where C is 0, its root.
+                Terms { a: (a, arc.error), b: one, c: (Polynomial::new(&c), arc.error * arc.error) }
+            }
+        }
+    }
+
+    fn is_ball(&self) -> bool {
+        matches!(self.arc, Some(Arc { shape: Shape::Ball { .. }, .. }))
+    }
+}
+
+/// A polynomial and the largest error of a value.
+type Noisy = (Polynomial, f64);
+
+/// A depth as (A -+ sqrt(C)) / B.
+struct Terms {
+    a: Noisy,
+    b: Noisy,
+    c: Noisy,
+}
+
+fn times(p: &Noisy, q: &Noisy) -> Noisy {
+    let (x, y) = (p.0.size(), q.0.size());
+    let rounding = 16.0 * UNIT_ROUNDOFF * x * y;
+    (p.0.times(&q.0), p.1 * y + q.1 * x + p.1 * q.1 + rounding)
+}
+
+fn minus(p: &Noisy, q: &Noisy) -> Noisy {
+    let rounding = 16.0 * UNIT_ROUNDOFF * (p.0.size() + q.0.size());
+    (p.0.minus(&q.0), p.1 + q.1 + rounding)
+}
+
+/// A polynomial that changes its sign wherever the two change places.
+fn meeting(a: &Curve, b: &Curve, s: f64, e: f64) -> Noisy {
+    let (p, q) = (a.on(s, e), b.on(s, e));
+    match (a.is_ball(), b.is_ball()) {
+        (false, false) => minus(&times(&p.a, &q.b), &times(&q.a, &p.b)),
+        (true, true) => {
+            let apart = minus(&p.a, &q.a);
+            let square = times(&apart, &apart);
+            let rest = minus(&minus(&p.c, &q.c), &square);
+            let four = (Polynomial::new(&[4.0]), 0.0);
+            minus(&times(&rest, &rest), &times(&four, &times(&square, &q.c)))
+        }
+        (ball_first, _) => {
+            let (ball, other) = if ball_first { (p, q) } else { (q, p) };
+            let off = minus(&other.a, &times(&ball.a, &other.b));
+            let square = times(&other.b, &other.b);
+            minus(&times(&off, &off), &times(&ball.c, &square))
         }
     }
 }
@@ -188,53 +270,31 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
     let (from, to) = (largest(a.line.start, b.line.start), least(a.line.end, b.line.end));
     let (from, to) = (largest(from, 0.0), least(to, 1.0));
     let mut runs = Runs::default();
-    // No stretch is split to less than this: neither ends nor depths have a meaning there.
-    let shortest = 16.0 * UNIT_ROUNDOFF;
-    let mut stack = [(0.0, 0.0); 64];
-    stack[0] = (from, to);
-    let mut open = usize::from(from < to);
-    while open > 0 {
-        open -= 1;
-        let (s, e) = stack[open];
-        let (p, q) = (a.band(s, e), b.band(s, e));
-        let (d0, d1) = (p.z0 - q.z0, p.z1 - q.z1);
-        let (below, above) = (p.below + q.above, p.above + q.below);
-        let noise = p.error + q.error;
-        if largest(d0, d1) + above < -noise {
-            runs.push(s, e, -1);
-            continue;
-        }
-        if least(d0, d1) - below > noise {
-            runs.push(s, e, 1);
-            continue;
-        }
-        let certain = |d: f64| i32::from(d > noise) - i32::from(d < -noise);
-        let (at_s, at_e) = (certain(d0), certain(d1));
-        let bulge = below + above;
-        // Bands as thin as rounding: lines.
-        if bulge <= noise || e - s <= shortest || open + 3 > stack.len() {
-            match (at_s, at_e) {
-                (0, 0) => runs.push(s, e, 0),
-                (x, y) if x * y < 0 => {
-                    let t = least(largest(s + (e - s) * (d0 / (d0 - d1)), s), e);
-                    runs.push(s, t, x);
-                    runs.push(t, e, y);
-                }
-                (x, y) => runs.push(s, e, x + y),
+    if from < to {
+        let (meeting, noise) = meeting(&a, &b, from, to);
+        let mut borders = [to; Polynomial::MOST + 2];
+        let mut count = 0;
+        meeting.sign_changes(noise, |at| {
+            if count <= Polynomial::MOST {
+                borders[count] = from + at * (to - from);
+                count += 1;
             }
-            continue;
-        }
-        let slope = (d1 - d0) / (e - s);
-        let crossing = s - d0 / slope;
-        let reach = 1.5 * (bulge + noise) / slope.abs();
-        let (left, right) = (crossing - reach, crossing + reach);
-        if at_s * at_e < 0 && s < left && right < e && right - left < 0.5 * (e - s) {
-            stack[open..open + 3].copy_from_slice(&[(right, e), (left, right), (s, left)]);
-            open += 3;
-        } else {
-            let middle = 0.5 * (s + e);
-            stack[open..open + 2].copy_from_slice(&[(middle, e), (s, middle)]);
-            open += 2;
+        });
+        let sign = |t: f64| {
+            let ((p, p_error), (q, q_error)) = (a.depth(t), b.depth(t));
+            let (difference, noise) = (p - q, p_error + q_error);
+            i32::from(difference > noise) - i32::from(difference < -noise)
+        };
+        let mut s = from;
+        for &e in &borders[..=count] {
+            if s < e {
+                // A change that hides in the noise of the polynomial shows at one of these.
+                for share in [1.0 / 64.0, 0.5, 63.0 / 64.0] {
+                    let at = s + share * (e - s);
+                    runs.push(at, s, sign(at));
+                }
+            }
+            s = e;
         }
     }
     runs.order(lower_wins)
@@ -245,34 +305,27 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
 struct Runs {
     first: i32,
     last: i32,
-    /// Since when it is equal.
-    equal_since: Option<f64>,
+    /// Where the last sign was seen.
+    seen: f64,
     count: usize,
     changes: [f64; Order::MOST],
 }
 
 impl Runs {
-    fn push(&mut self, s: f64, _e: f64, sign: i32) {
-        let sign = sign.signum();
+    /// The sign at `t`, behind a border at `border`, which is where it changes if it was another before
+    /// that.
+    fn push(&mut self, t: f64, border: f64, sign: i32) {
         if sign == 0 {
-            self.equal_since.get_or_insert(s);
             return;
         }
         if self.last == 0 {
             self.first = sign;
-        } else if self.last != sign {
-            // In the middle of where both are equal.
-            let at = self.equal_since.map_or(s, |since| 0.5 * (since + s));
-            if self.count < Order::MOST {
-                self.changes[self.count] = at;
-                self.count += 1;
-            } else {
-                // Two more that touch: they take the last change back.
-                self.count -= 1;
-            }
+        } else if self.last != sign && self.count < Order::MOST {
+            let at = if self.seen < border { border } else { 0.5 * (self.seen + t) };
+            self.changes[self.count] = at;
+            self.count += 1;
         }
-        self.last = sign;
-        self.equal_since = None;
+        (self.last, self.seen) = (sign, t);
     }
 
     fn order(self, lower_wins: bool) -> Order {

@@ -46,7 +46,7 @@ use sightline_geometry::gamma;
 
 use crate::{
     arc::{Arc, Shape},
-    bernstein::{cubic, cubic_on, cubic_sign_changes, linear, quadratic},
+    bernstein::{Polynomial, cubic, cubic_on, linear, quadratic},
     bounds::ErrorBounds,
     envelope::{largest, least},
     quadratic::sign_changes,
@@ -406,7 +406,7 @@ impl<'a> MovingRow<'a> {
         let (length, noise) = (end - start, self.triangle.n_error);
         let mut borders = Few::<f64, 5>::new();
         borders.push(start);
-        cubic_sign_changes(cubic_on(n, start, end), noise, |at| {
+        Polynomial::new(&cubic_on(n, start, end)).sign_changes(noise, |at| {
             if borders.len < 4 {
                 borders.push(start + at * length);
             }
