@@ -83,6 +83,9 @@ pub struct Band {
     pub above: f64,
     /// Rounding error of all depths, metres.
     pub error: f64,
+    /// False when parts of the stretch may have much less of that: where a triangle is seen edge-on at one
+    /// end, D is small there and noise is large.
+    pub even: bool,
 }
 
 impl Arc {
@@ -111,12 +114,18 @@ impl Arc {
     pub fn band(&self, s: f64, e: f64) -> Band {
         let (z0, z1) = (self.depth(s), self.depth(e));
         let whole = self.far - self.near;
+        let mut even = true;
         let (below, above, error) = match &self.shape {
             Shape::Rational { n, d, n_error, d_error } => {
                 let (n, d) = (cubic_on(*n, s, e), quadratic_on(*d, s, e));
                 let least_d = least(least(d[0].abs(), d[1].abs()), d[2].abs());
+                let largest_d = largest(largest(d[0].abs(), d[1].abs()), d[2].abs());
                 let one_sign = (d[0] > 0.0) == (d[1] > 0.0) && (d[1] > 0.0) == (d[2] > 0.0);
-                if !one_sign || least_d <= 2.0 * d_error {
+                if largest_d <= 4.0 * d_error {
+                    // D is rounding all over: no part of the stretch tells more than the corners do.
+                    (0.0, 0.0, self.error + whole)
+                } else if !one_sign || least_d <= 2.0 * d_error {
+                    even = false;
                     (whole, whole, self.error)
                 } else {
                     let inner = [
@@ -126,7 +135,8 @@ impl Arc {
                     let inverse = 1.0 / (least_d - d_error);
                     let bulge = 0.75 * largest(inner[0].abs(), inner[1].abs()) * inverse;
                     let noise = 2.0 * (n_error + self.far * d_error) * inverse;
-                    let bulge = least(bulge + noise, whole);
+                    let bulge = least(bulge, whole);
+                    even = noise <= self.error || largest_d <= 4.0 * least_d;
                     (bulge, bulge, self.error + least(noise, whole))
                 }
             }
@@ -139,7 +149,7 @@ impl Arc {
                 if *from_inside { (0.0, bulge, self.error) } else { (bulge, 0.0, self.error) }
             }
         };
-        Band { z0, z1, below, above, error }
+        Band { z0, z1, below, above, error, even }
     }
 }
 
@@ -175,9 +185,84 @@ impl Curve<'_> {
             Some(arc) => arc.band(s, e),
             None => {
                 let (z0, z1) = (self.line.depth(s), self.line.depth(e));
-                Band { z0, z1, below: 0.0, above: 0.0, error: self.line.above }
+                Band { z0, z1, below: 0.0, above: 0.0, error: self.line.above, even: true }
             }
         }
+    }
+}
+
+/// N, D and their errors on a stretch, Bernstein coefficients.
+type OnStretch = ([f64; 4], [f64; 3], f64, f64);
+
+impl Curve<'_> {
+    /// A line, or the depth of a triangle, as a quotient on `s..e`.
+    fn quotient(&self, s: f64, e: f64) -> Option<OnStretch> {
+        match self.arc.map(|arc| &arc.shape) {
+            None => {
+                let (a, b) = (self.line.depth(s), self.line.depth(e));
+                let n = [a, (2.0 * a + b) / 3.0, (a + 2.0 * b) / 3.0, b];
+                Some((n, [1.0; 3], 4.0 * UNIT_ROUNDOFF * largest(a, b), 0.0))
+            }
+            Some(Shape::Rational { n, d, n_error, d_error }) => {
+                Some((cubic_on(*n, s, e), quadratic_on(*d, s, e), *n_error, *d_error))
+            }
+            Some(Shape::Ball { .. }) => None,
+        }
+    }
+}
+
+/// The sign of the difference of two depths all over `s..e`, where that is certain; 0 where both are equal
+/// within their bounds. `error` is that of both depths at exact N and D.
+///
+/// Two arcs that run side by side have bands that overlap until both are as thin as they are apart, which
+/// is never for two triangles of one plane. Their difference does not bend: of quotients it has the sign
+/// of `N D' - N' D`, of degree 5, times that of `D D'`; that of two spheres is at most the difference of
+/// their feet and the root of that of their g.
+fn side_by_side(a: Curve, b: Curve, (s, e): (f64, f64), error: f64) -> Option<i32> {
+    if let (Some(a), Some(b)) = (a.arc, b.arc)
+        && let (
+            Shape::Ball { foot: f, g, inverse, from_inside },
+            Shape::Ball { foot: k, g: h, from_inside: other, .. },
+        ) = (&a.shape, &b.shape)
+    {
+        let apart = |x: &[f64], y: &[f64]| {
+            x.iter().zip(y).fold(0.0, |most, (x, y)| largest(most, (x - y).abs()))
+        };
+        let off = apart(f, k) + apart(g, h).sqrt() * inverse;
+        return (from_inside == other && off <= error).then_some(0);
+    }
+    let (n, d, n_error, d_error) = a.quotient(s, e)?;
+    let (m, f, m_error, f_error) = b.quotient(s, e)?;
+    let size = |of: &[f64]| of.iter().fold(0.0, |most, v| largest(most, v.abs()));
+    let (d_size, f_size) = (size(&d), size(&f));
+    let one_sign = |v: &[f64; 3]| (v[0] > 0.0) == (v[1] > 0.0) && (v[1] > 0.0) == (v[2] > 0.0);
+    if !one_sign(&d) || !one_sign(&f) {
+        return None;
+    }
+    // C(3, i) C(2, j) / C(5, i + j).
+    let p = |i: usize, j: usize| n[i] * f[j] - m[i] * d[j];
+    let difference = [
+        p(0, 0),
+        (2.0 * p(0, 1) + 3.0 * p(1, 0)) / 5.0,
+        (p(0, 2) + 6.0 * p(1, 1) + 3.0 * p(2, 0)) / 10.0,
+        (3.0 * p(1, 2) + 6.0 * p(2, 1) + p(3, 0)) / 10.0,
+        (3.0 * p(2, 2) + 2.0 * p(3, 1)) / 5.0,
+        p(3, 2),
+    ];
+    let noise = error * d_size * f_size
+        + n_error * f_size
+        + size(&n) * f_error
+        + m_error * d_size
+        + size(&m) * d_error;
+    let sign = if (d[0] > 0.0) == (f[0] > 0.0) { 1 } else { -1 };
+    if difference.iter().all(|v| v.abs() <= noise) {
+        Some(0)
+    } else if difference.iter().all(|v| *v > noise) {
+        Some(sign)
+    } else if difference.iter().all(|v| *v < -noise) {
+        Some(-sign)
+    } else {
+        None
     }
 }
 
@@ -190,6 +275,10 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
     let mut runs = Runs::default();
     // No stretch is split to less than this: neither ends nor depths have a meaning there.
     let shortest = 16.0 * UNIT_ROUNDOFF;
+    // Nor are more stretches looked at: a hundred or two are many.
+    let mut left = 1 << 14;
+    // What both are off by, whatever D is.
+    let base = [a, b].map(|c| c.arc.map_or(c.line.above, |arc| arc.error));
     let mut stack = [(0.0, 0.0); 64];
     stack[0] = (from, to);
     let mut open = usize::from(from < to);
@@ -208,11 +297,19 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
             runs.push(s, e, 1);
             continue;
         }
+        if p.even && q.even {
+            if let Some(sign) = side_by_side(a, b, (s, e), base[0] + base[1]) {
+                runs.push(s, e, sign);
+                continue;
+            }
+        }
         let certain = |d: f64| i32::from(d > noise) - i32::from(d < -noise);
         let (at_s, at_e) = (certain(d0), certain(d1));
         let bulge = below + above;
+        let thin = bulge <= noise && p.even && q.even;
+        left -= 1;
         // Bands as thin as rounding: lines.
-        if bulge <= noise || e - s <= shortest || open + 3 > stack.len() {
+        if thin || e - s <= shortest || open + 3 > stack.len() || left <= 0 {
             match (at_s, at_e) {
                 (0, 0) => runs.push(s, e, 0),
                 (x, y) if x * y < 0 => {
