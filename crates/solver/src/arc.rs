@@ -48,6 +48,8 @@ pub enum Shape {
         foot: [f64; 2],
         /// g: positive where the ray meets it.
         g: [f64; 3],
+        /// Largest error of a value of g.
+        noise: f64,
         /// 1 / k.
         inverse: f64,
         /// True when it is seen from inside.
@@ -94,7 +96,7 @@ impl Arc {
     pub fn depth(&self, t: f64) -> f64 {
         let z = match &self.shape {
             Shape::Rational { n, d, .. } => cubic(*n, t) / quadratic(*d, t),
-            Shape::Ball { foot, g, inverse, from_inside } => {
+            Shape::Ball { foot, g, inverse, from_inside, .. } => {
                 let half = largest(quadratic(*g, t), 0.0).sqrt() * inverse;
                 linear(*foot, t) + if *from_inside { half } else { -half }
             }
@@ -134,19 +136,27 @@ impl Arc {
                     ];
                     let inverse = 1.0 / (least_d - d_error);
                     let bulge = 0.75 * largest(inner[0].abs(), inner[1].abs()) * inverse;
-                    let noise = 2.0 * (n_error + self.far * d_error) * inverse;
                     let bulge = least(bulge, whole);
-                    even = noise <= self.error || largest_d <= 4.0 * least_d;
+                    // What moves fast may be far away at another time: here no depth is beyond this.
+                    let top = least(largest(z0, z1) + bulge, self.far);
+                    let noise = 2.0 * (n_error + top * d_error) * inverse;
+                    let like = top * d_error <= *n_error || top <= 4.0 * least(z0, z1);
+                    even = noise <= self.error || (largest_d <= 4.0 * least_d && like);
                     (bulge, bulge, self.error + least(noise, whole))
                 }
             }
-            Shape::Ball { g, inverse, from_inside, .. } => {
+            Shape::Ball { g, noise, inverse, from_inside, .. } => {
                 let g = quadratic_on(*g, s, e);
                 let root = |v: f64| largest(v, 0.0).sqrt();
                 let (h0, h1) = (root(g[0]), root(g[2]));
                 let k = largest((h1 - h0) * (h1 - h0) - (g[0] - 2.0 * g[1] + g[2]), 0.0);
                 let bulge = least(0.5 * k.sqrt(), k / (8.0 * least(h0, h1))) * inverse;
-                if *from_inside { (0.0, bulge, self.error) } else { (bulge, 0.0, self.error) }
+                // A root of g is off by noise / (2 sqrt(g)), or the root of noise where g is no more.
+                let (low, high) = (least(least(g[0], g[1]), g[2]), largest(largest(g[0], g[1]), g[2]));
+                let off = if low > *noise { noise / low.sqrt() } else { noise.sqrt() };
+                let error = self.error + off * inverse;
+                even = off * inverse <= self.error || high <= 16.0 * largest(low, *noise);
+                if *from_inside { (0.0, bulge, error) } else { (bulge, 0.0, error) }
             }
         };
         Band { z0, z1, below, above, error, even }
@@ -212,24 +222,32 @@ impl Curve<'_> {
 }
 
 /// The sign of the difference of two depths all over `s..e`, where that is certain; 0 where both are equal
-/// within their bounds. `error` is that of both depths at exact N and D.
+/// within their bounds. `error` is that of both depths at exact N and D, `noise` that of their bands.
 ///
 /// Two arcs that run side by side have bands that overlap until both are as thin as they are apart, which
 /// is never for two triangles of one plane. Their difference does not bend: of quotients it has the sign
 /// of `N D' - N' D`, of degree 5, times that of `D D'`; that of two spheres is at most the difference of
-/// their feet and the root of that of their g.
-fn side_by_side(a: Curve, b: Curve, (s, e): (f64, f64), error: f64) -> Option<i32> {
+/// their feet and of the roots of their g.
+fn side_by_side(
+    a: Curve,
+    b: Curve,
+    (s, e): (f64, f64),
+    error: f64,
+    noise: f64,
+) -> Option<i32> {
     if let (Some(a), Some(b)) = (a.arc, b.arc)
         && let (
-            Shape::Ball { foot: f, g, inverse, from_inside },
+            Shape::Ball { foot: f, g, inverse, from_inside, .. },
             Shape::Ball { foot: k, g: h, from_inside: other, .. },
         ) = (&a.shape, &b.shape)
     {
-        let apart = |x: &[f64], y: &[f64]| {
-            x.iter().zip(y).fold(0.0, |most, (x, y)| largest(most, (x - y).abs()))
-        };
-        let off = apart(f, k) + apart(g, h).sqrt() * inverse;
-        return (from_inside == other && off <= error).then_some(0);
+        let feet = largest((linear(*f, s) - linear(*k, s)).abs(), (linear(*f, e) - linear(*k, e)).abs());
+        let (g, h) = (quadratic_on(*g, s, e), quadratic_on(*h, s, e));
+        let apart = g.iter().zip(&h).fold(0.0, |most, (x, y)| largest(most, (x - y).abs()));
+        let low = g.iter().chain(&h).fold(f64::INFINITY, |low, v| least(low, *v));
+        // |sqrt(g) - sqrt(h)| = |g - h| / (sqrt(g) + sqrt(h)).
+        let roots = if low > apart { apart / (2.0 * low.sqrt()) } else { apart.sqrt() };
+        return (from_inside == other && feet + roots * inverse <= noise).then_some(0);
     }
     let (n, d, n_error, d_error) = a.quotient(s, e)?;
     let (m, f, m_error, f_error) = b.quotient(s, e)?;
@@ -249,17 +267,17 @@ fn side_by_side(a: Curve, b: Curve, (s, e): (f64, f64), error: f64) -> Option<i3
         (3.0 * p(2, 2) + 2.0 * p(3, 1)) / 5.0,
         p(3, 2),
     ];
-    let noise = error * d_size * f_size
+    let most = error * d_size * f_size
         + n_error * f_size
         + size(&n) * f_error
         + m_error * d_size
         + size(&m) * d_error;
     let sign = if (d[0] > 0.0) == (f[0] > 0.0) { 1 } else { -1 };
-    if difference.iter().all(|v| v.abs() <= noise) {
+    if difference.iter().all(|v| v.abs() <= most) {
         Some(0)
-    } else if difference.iter().all(|v| *v > noise) {
+    } else if difference.iter().all(|v| *v > most) {
         Some(sign)
-    } else if difference.iter().all(|v| *v < -noise) {
+    } else if difference.iter().all(|v| *v < -most) {
         Some(-sign)
     } else {
         None
@@ -298,7 +316,7 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
             continue;
         }
         if p.even && q.even {
-            if let Some(sign) = side_by_side(a, b, (s, e), base[0] + base[1]) {
+            if let Some(sign) = side_by_side(a, b, (s, e), base[0] + base[1], noise) {
                 runs.push(s, e, sign);
                 continue;
             }

@@ -83,6 +83,7 @@ enum Cover {
 }
 
 /// Floats of a primitive at both ends of the path.
+#[derive(Debug)]
 enum Flat {
     Triangle([[[f64; 3]; 3]; 2]),
     Sphere([[f64; 3]; 2], [f64; 2]),
@@ -332,11 +333,20 @@ impl Along<'_> {
                     }
                 }
             }
-            Flat::Sphere(_, radii) => {
+            Flat::Sphere(centers, radii) => {
                 let k = 1.0 + self.c * self.c + self.w * self.w;
                 let r = radii[0].max(radii[1]);
                 let moved = depth * (2.0 + self.c.abs() + self.w.abs()) * k.sqrt();
-                let noise = 2.0 * k.sqrt() * r * moved + moved * moved + gamma(8) * k * r * r;
+                // The largest distance from the ray, at an end of the path, squared, times k.
+                let off = (0..2).fold(0.0f64, |most, end| {
+                    let p = centers[end];
+                    let (x, z) = (p[0] - end as f64 * self.judge.length, p[2]);
+                    let (g, h) = (x - self.c * z, p[1] - self.w * z);
+                    most.max(g * g + h * h + (g * self.w - h * self.c).powi(2))
+                });
+                let noise = 2.0 * k.sqrt() * r * moved
+                    + moved * moved
+                    + gamma(8) * (k * r * r + off) * 1.01;
                 let off = 3.0 * (depth * (1.0 + self.c.abs()) + noise.sqrt() / k);
                 (low - off, high + off)
             }
@@ -468,13 +478,17 @@ impl Along<'_> {
             let solid = self.solids.iter().find(|s| Some(s.primitive) == p);
             solid.map(|s| {
                 let exact = self.cover(&s.flat, t, 0.0);
-                format!("{} {exact:?}, widened {:?}", s.primitive, self.widened(&s.flat, t))
+                let widened = self.widened(&s.flat, t);
+                format!("{} {exact:?}, widened {widened:?}, {:?}", s.primitive, s.flat)
             })
         };
         Verdict::Unexplained(format!(
-            "{what} at t = {t:?}, c = {}, w = {}: found {answer:?} ({:?}), exact {truth:?} ({:?})",
+            "{what} at t = {t:?}, c = {:?}, w = {:?}, L = {:?}, D = {:e}: found {answer:?} ({:?}), \
+             exact {truth:?} ({:?})",
             self.c,
             self.w,
+            self.judge.length,
+            self.judge.bounds.depth,
             tell(answer),
             tell(truth)
         ))
