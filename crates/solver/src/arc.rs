@@ -55,6 +55,8 @@ pub enum Shape {
         foot: [f64; 2],
         /// g: positive where the ray meets it.
         g: [f64; 3],
+        /// Largest error of a value of g.
+        noise: f64,
         /// 1 / k.
         inverse: f64,
         /// True when it is seen from inside.
@@ -98,7 +100,7 @@ impl Arc {
     pub fn depth(&self, t: f64) -> f64 {
         let z = match &self.shape {
             Shape::Rational { n, d, .. } => cubic(*n, t) / quadratic(*d, t),
-            Shape::Ball { foot, g, inverse, from_inside } => {
+            Shape::Ball { foot, g, inverse, from_inside, .. } => {
                 let half = largest(quadratic(*g, t), 0.0).sqrt() * inverse;
                 linear(*foot, t) + if *from_inside { half } else { -half }
             }
@@ -132,22 +134,33 @@ impl Arc {
                     ];
                     let inverse = 1.0 / (least_d - d_error);
                     let bulge = 0.75 * largest(inner[0].abs(), inner[1].abs()) * inverse;
-                    let noise = 2.0 * (n_error + self.far * d_error) * inverse;
-                    let bulge = least(bulge + noise, whole);
+                    let bulge = least(bulge, whole);
+                    // What moves fast may be far away at another time: here no depth is beyond this.
+                    let top = least(largest(z0, z1) + bulge, self.far);
+                    let noise = 2.0 * (n_error + top * d_error) * inverse;
                     (bulge, bulge, self.error + least(noise, whole))
                 }
             }
-            Shape::Ball { g, inverse, from_inside, .. } => {
+            Shape::Ball { g, noise, inverse, from_inside, .. } => {
                 let g = quadratic_on(*g, s, e);
                 let root = |v: f64| largest(v, 0.0).sqrt();
                 let (h0, h1) = (root(g[0]), root(g[2]));
                 let k = largest((h1 - h0) * (h1 - h0) - (g[0] - 2.0 * g[1] + g[2]), 0.0);
                 let bulge = least(0.5 * k.sqrt(), k / (8.0 * least(h0, h1))) * inverse;
-                if *from_inside { (0.0, bulge, self.error) } else { (bulge, 0.0, self.error) }
+                let low = least(least(g[0], g[1]), g[2]);
+                let error = self.error + root_noise(low, *noise) * inverse;
+                if *from_inside { (0.0, bulge, error) } else { (bulge, 0.0, error) }
             }
         };
         Band { z0, z1, below, above, error }
     }
+}
+
+/// What the root of a value v of a function is off by where that is off by `noise`: noise / sqrt(v), or
+/// the root of the noise where v is no more.
+#[inline(always)]
+fn root_noise(v: f64, noise: f64) -> f64 {
+    if v > noise { noise / v.sqrt() } else { noise.sqrt() }
 }
 
 /// Who is nearer, stretch by stretch.
@@ -187,7 +200,9 @@ impl Curve<'_> {
                 // NaN, where D is 0, becomes the whole.
                 arc.error + if noise < arc.far - arc.near { noise } else { arc.far - arc.near }
             }
-            Shape::Ball { .. } => arc.error,
+            Shape::Ball { g, noise, inverse, .. } => {
+                arc.error + root_noise(quadratic(*g, t), *noise) * inverse
+            }
         };
         (z, error)
     }
@@ -206,12 +221,11 @@ impl Curve<'_> {
                 b: (Polynomial::new(&quadratic_on(*d, s, e)), *d_error),
                 c: none,
             },
-            Shape::Ball { foot, g, inverse, .. } => {
+            Shape::Ball { foot, g, noise, inverse, .. } => {
                 let a = Polynomial::new(&[linear(*foot, s), linear(*foot, e)]);
                 let scale = inverse * inverse;
                 let c = quadratic_on(*g, s, e).map(|g| g * scale);
-                // The error of a depth is that of sqrt(C) where C is 0, its root.
-                Terms { a: (a, arc.error), b: one, c: (Polynomial::new(&c), arc.error * arc.error) }
+                Terms { a: (a, arc.error), b: one, c: (Polynomial::new(&c), noise * scale) }
             }
         }
     }

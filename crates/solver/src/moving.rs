@@ -567,7 +567,9 @@ impl MovingSphere {
         let size = dd.sqrt();
         let radius = largest(r0, r1);
         let moved = bounds.depth * (2.0 + c.abs() + w.abs()) * size;
-        let noise = 2.0 * size * radius * moved + moved * moved + gamma(8) * dd * radius * radius;
+        // What passes fast is far off at the ends, where products of that size are rounded.
+        let products = dd * radius * radius + largest(product(a, a), product(b, b));
+        let noise = 2.0 * size * radius * moved + moved * moved + gamma(8) * products;
         let bend = g[0] - 2.0 * g[1] + g[2];
         let slope_at = |t: f64| 2.0 * ((1.0 - t) * (g[1] - g[0]) + t * (g[2] - g[1]));
         let end_error = |t: f64| {
@@ -580,10 +582,10 @@ impl MovingSphere {
         let reach = radius / size;
         let (low, high) = (least(foot[0], foot[1]) - reach, largest(foot[0], foot[1]) + reach);
         let arc = |from_inside: bool| Arc {
-            shape: Shape::Ball { foot, g, inverse, from_inside },
+            shape: Shape::Ball { foot, g, noise, inverse, from_inside },
             near: largest(low, 0.0),
             far: high,
-            error: depth_error,
+            error: bounds.depth * (1.0 + c.abs()),
             time_error: error,
         };
         let whole = Covered { start, end, error };
@@ -594,7 +596,7 @@ impl MovingSphere {
         if high <= depth_error {
             return;
         }
-        self.around_camera(whole, &arc, &mut covered);
+        self.around_camera(whole, bounds, &arc, &mut covered);
     }
 
     /// A sphere that reaches the camera plane: parts of an interval on which it is in front, seen from
@@ -604,6 +606,7 @@ impl MovingSphere {
     fn around_camera(
         &self,
         whole: Covered,
+        bounds: &ErrorBounds,
         arc: &dyn Fn(bool) -> Arc,
         covered: &mut dyn FnMut(Covered, Arc),
     ) {
@@ -617,6 +620,16 @@ impl MovingSphere {
         let (count, places) = sign_changes(m[0], m[1], m[2]);
         let mut inner = Few::<f64, 3>::new();
         places[..count].iter().for_each(|&t| inner.push(t));
+        // At the surface |q| is r, and each coordinate is off by D; and m is rounded.
+        let (r, d) = (largest(r0, r1), bounds.depth);
+        let products = r * r + largest(q0.length_squared(), q1.length_squared());
+        let noise = 4.0 * r * d + 3.0 * d * d + gamma(8) * products;
+        let bend = m[0] - 2.0 * m[1] + m[2];
+        let slope_at = |t: f64| 2.0 * ((1.0 - t) * (m[1] - m[0]) + t * (m[2] - m[1]));
+        let passing = places[..count]
+            .iter()
+            .fold(0.0, |most, &t| largest(most, least(root_error(slope_at(t), bend, noise), 1.0)));
+        let whole = Covered { error: largest(whole.error, passing), ..whole };
         // Where the foot passes the camera plane, outside of the sphere: nothing is met there, but
         // rounding may say so.
         let Shape::Ball { foot, .. } = arc(false).shape else { return };
@@ -637,7 +650,8 @@ impl MovingSphere {
             let inside = quadratic(m, middle) < 0.0;
             let in_front = inside || linear(foot, middle) > 0.0;
             if from < to && in_front {
-                covered(Covered { start: from, end: to, ..whole }, arc(inside));
+                let arc = Arc { time_error: whole.error, ..arc(inside) };
+                covered(Covered { start: from, end: to, ..whole }, arc);
             }
         }
     }

@@ -6,6 +6,10 @@
 //! ends and all crossings, and looks who is nearest in the middle of each gap between them; equal
 //! depth goes to the lower primitive number. Slow on purpose: tests compare the fast solver with
 //! it on small scenes.
+//!
+//! What moves, and spheres, have a twin of their own: [`motion`].
+
+pub mod motion;
 
 use dashu_ratio::RBig;
 use glam::DVec3;
@@ -13,7 +17,8 @@ use sightline_geometry::{
     FACE_COUNT, Face, InstanceId, InstancedGeometry, RectifiedFrame, Sampling, ViewSegment,
 };
 
-type V3 = [RBig; 3];
+/// A point or a vector, exact.
+pub type V3 = [RBig; 3];
 
 /// A stretch of a pixel's list, exact.
 #[derive(Clone, Debug, PartialEq)]

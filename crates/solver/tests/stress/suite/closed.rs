@@ -93,13 +93,13 @@ pub fn leaks(case: &Case, found: &SegmentVisibility) -> Vec<String> {
 
 /// Vertices and triangles of a closed mesh.
 #[derive(Clone)]
-struct Closed {
-    positions: Vec<DVec3>,
-    triangles: Vec<[u32; 3]>,
+pub struct Closed {
+    pub positions: Vec<DVec3>,
+    pub triangles: Vec<[u32; 3]>,
 }
 
 impl Closed {
-    fn map(mut self, mut to: impl FnMut(DVec3) -> DVec3) -> Self {
+    pub fn map(mut self, mut to: impl FnMut(DVec3) -> DVec3) -> Self {
         for p in &mut self.positions {
             *p = to(*p);
         }
@@ -121,7 +121,7 @@ impl Closed {
     }
 
     /// Panics when an edge does not belong to two triangles, once in each direction.
-    fn assert_closed(&self) {
+    pub fn assert_closed(&self) {
         let mut edges: HashMap<(u32, u32), i32> = HashMap::new();
         for &[a, b, c] in &self.triangles {
             for (p, q) in [(a, b), (b, c), (c, a)] {
@@ -201,7 +201,7 @@ fn uv_sphere(rings: u32, sectors: u32) -> Closed {
 }
 
 /// A torus about z: the tube's axis is a circle of radius 3, the tube has radius 1.
-fn torus(around: u32, across: u32) -> Closed {
+pub fn torus(around: u32, across: u32) -> Closed {
     let mut positions = Vec::new();
     let mut triangles = Vec::new();
     for i in 0..around {
@@ -224,7 +224,7 @@ fn torus(around: u32, across: u32) -> Closed {
 
 /// The surface of the cube of half side n, each side divided into 2n x 2n squares of two
 /// triangles, diagonals at random. Coordinates are whole numbers.
-fn grid_box(random: &mut Random, n: i32) -> Closed {
+pub fn grid_box(random: &mut Random, n: i32) -> Closed {
     let mut numbers: HashMap<[i32; 3], u32> = HashMap::new();
     let mut positions = Vec::new();
     let mut triangles = Vec::new();
@@ -260,14 +260,14 @@ fn grid_box(random: &mut Random, n: i32) -> Closed {
     Closed { positions, triangles }
 }
 
-fn large_sampling(random: &mut Random) -> Sampling {
+pub fn large_sampling(random: &mut Random) -> Sampling {
     let (rows, columns) =
         random.pick(&[(16, 16), (32, 64), (64, 64), (128, 128), (64, 256), (8, 256)]);
     let sampling = Sampling::with_columns(rows, columns);
     if random.one_in(2) { sampling } else { sampling.jittered(random.below(1000) as u32) }
 }
 
-fn sphere(random: &mut Random) -> Closed {
+pub fn sphere(random: &mut Random) -> Closed {
     let closed = if random.one_in(2) {
         octasphere(2 + random.below(14) as i32)
     } else {
@@ -284,7 +284,7 @@ fn sphere(random: &mut Random) -> Closed {
 
 /// Radii of 1 to 3: no point of a triangle is nearer to the centre than the cosine of half the
 /// angle between its corners, which is over a half for all spheres made here.
-fn star(random: &mut Random) -> Closed {
+pub fn star(random: &mut Random) -> Closed {
     let rough = random.magnitude(1e-3..2.0);
     sphere(random).map(|p| p * (1.0 + rough * random.unit()))
 }
@@ -351,7 +351,7 @@ fn scaled(by: f64, at: DVec3) -> DAffine3 {
     DAffine3::from_mat3_translation(DMat3::from_diagonal(DVec3::splat(by)), at)
 }
 
-fn any_pose(random: &mut Random, length: f64) -> Pose {
+pub fn any_pose(random: &mut Random, length: f64) -> Pose {
     match random.below(3) {
         0 => Pose::aligned(random, length),
         1 => Pose::free(random, length, 1e3),
