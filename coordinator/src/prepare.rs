@@ -93,7 +93,7 @@ pub fn prepare_scene(
         numbering: numbering(&scene),
         source: source(&reference),
     };
-    let plan = plan(reference, config, cells, skipped);
+    let plan = plan(reference, config, key_times(&scene), cells, skipped);
     tracing::info!(
         cells = plan.cells.len(),
         segments = plan.segments.len(),
@@ -101,6 +101,17 @@ pub fn prepare_scene(
         "the bake is planned"
     );
     Ok(Prepared { scene, plan, publisher })
+}
+
+/// Times of the scene's key frames, seconds.
+// To be replaced by `Scene::key_times` as soon as scenes tell when their key frames are: until then
+// every state takes a second.
+fn key_times(scene: &Scene) -> Vec<f64> {
+    let geometry = &scene.geometry;
+    if geometry.states == 1 && !geometry.has_motion() {
+        return vec![0.0];
+    }
+    (0..=geometry.states).map(f64::from).collect()
 }
 
 fn region_spec(config: &BakeConfig) -> RegionSpec {

@@ -319,6 +319,10 @@ pub struct ConfigFlags {
 enum Shape {
     /// One TOML value as it is.
     Plain,
+    /// One text, whatever it looks like.
+    Text,
+    /// Repeatable files.
+    Files,
     /// Repeatable patterns.
     Patterns,
     /// Repeatable rectangles.
@@ -331,6 +335,8 @@ enum Shape {
 
 fn shape(key: &KeyDoc) -> Shape {
     match key.kind {
+        "text or an integer" => Shape::Text,
+        "list of paths" => Shape::Files,
         "list of glob patterns" => Shape::Patterns,
         "list of [x0, z0, x1, z1]" => Shape::Rectangles,
         "list of lists of [x, z]" => Shape::Polygons,
@@ -360,8 +366,8 @@ fn flag_help(key: &KeyDoc) -> String {
     }
     match shape(key) {
         Shape::Patterns => help.push_str(" Can be repeated; an empty text stands for no pattern."),
-        Shape::Rectangles | Shape::Polygons => help.push_str(" Can be repeated."),
-        Shape::Plain | Shape::Range => {}
+        Shape::Rectangles | Shape::Polygons | Shape::Files => help.push_str(" Can be repeated."),
+        Shape::Plain | Shape::Text | Shape::Range => {}
     }
     help
 }
@@ -377,6 +383,8 @@ impl Args for ConfigFlags {
                 .allow_hyphen_values(true);
             let arg = match shape(key) {
                 Shape::Plain => arg.value_name("VALUE"),
+                Shape::Text => arg.value_name("NAME"),
+                Shape::Files => arg.value_name("FILE").action(ArgAction::Append),
                 Shape::Patterns => arg.value_name("PATTERN").action(ArgAction::Append),
                 Shape::Rectangles => arg
                     .value_name("X0,Z0,X1,Z1")
@@ -420,14 +428,18 @@ fn toml_value(shape: Shape, values: &[&str]) -> String {
     match shape {
         Shape::Plain | Shape::Range => values.last().copied().unwrap_or_default().to_owned(),
         Shape::Rectangles | Shape::Polygons => format!("[{}]", values.join(", ")),
-        Shape::Patterns => {
-            // A JSON string is a TOML string.
-            let quoted = values.iter().filter(|v| !v.is_empty());
+        Shape::Text => quoted(values.last().copied().unwrap_or_default()),
+        Shape::Patterns | Shape::Files => {
             let quoted: Vec<String> =
-                quoted.map(|v| serde_json::Value::from(*v).to_string()).collect();
+                values.iter().filter(|v| !v.is_empty()).map(|v| quoted(v)).collect();
             format!("[{}]", quoted.join(", "))
         }
     }
+}
+
+/// A JSON string is a TOML string.
+fn quoted(text: &str) -> String {
+    serde_json::Value::from(text).to_string()
 }
 
 fn numbers(text: &str) -> Result<Vec<f64>, String> {
