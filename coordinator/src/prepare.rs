@@ -91,7 +91,7 @@ pub fn prepare_scene(
     let publisher = DatasetPublisher {
         objects: objects(&scene),
         numbering: numbering(&scene),
-        source: source(&reference),
+        source: source(&reference, &scene),
     };
     let plan = plan(reference, config, key_times(&scene), cells, skipped);
     tracing::info!(
@@ -145,7 +145,8 @@ fn scene_ref(scene: &Scene, path: &Path) -> SceneRef {
     }
 }
 
-fn source(scene: &SceneRef) -> SceneSource {
+fn source(scene: &SceneRef, read: &Scene) -> SceneSource {
+    let geometry = &read.geometry;
     let file = |f: &SceneFile| StoredFile {
         name: f.path.clone(),
         bytes: f.bytes,
@@ -155,7 +156,9 @@ fn source(scene: &SceneRef) -> SceneSource {
         uri: scene.name.clone(),
         hash: scene.digest.clone(),
         files: scene.files.iter().map(file).collect(),
-        // Numbers are filled in from the objects.
+        particles: u64::from(geometry.primitive_count() - geometry.triangle_count()),
+        particle_systems: geometry.particles.len() as u64,
+        // The other numbers are filled in from the objects.
         ..SceneSource::default()
     }
 }

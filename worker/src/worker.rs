@@ -174,14 +174,19 @@ impl Life {
             Some(scene) => Arc::clone(scene),
             None => self.read_scene(&path, plan).await?,
         };
-        if scene.digest.combined == session.scene_digest {
-            return Ok(scene);
+        if scene.digest.combined != session.scene_digest {
+            return Err(WorkerError::OtherScene {
+                path: path.display().to_string(),
+                found: scene.digest.combined.clone(),
+                expected: session.scene_digest.clone(),
+            });
         }
-        Err(WorkerError::OtherScene {
-            path: path.display().to_string(),
-            found: scene.digest.combined.clone(),
-            expected: session.scene_digest.clone(),
-        })
+        let (found, expected) = (scene.geometry.states, plan.states());
+        if found != expected {
+            let path = path.display().to_string();
+            return Err(WorkerError::OtherStates { path, found, expected });
+        }
+        Ok(scene)
     }
 
     async fn read_scene(&self, path: &Path, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {

@@ -196,6 +196,9 @@ pub struct Verify {
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     #[arg(requires = "cell", conflicts_with = "viewpoints")]
     pub viewpoint: Option<glam::DVec3>,
+    /// When that viewpoint is looked at: a state, and how far it has gone, from 0 to 1.
+    #[arg(long, value_name = "STATE,T", value_parser = parse_moment, requires = "viewpoint")]
+    pub moment: Option<sightline_geometry::Moment>,
     /// Seed of viewpoints and directions.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
@@ -481,6 +484,16 @@ fn parse_point(text: &str) -> Result<glam::DVec3, String> {
         [x, y, z] => Ok(glam::DVec3::new(x, y, z)),
         _ => Err("give three numbers: x,y,z".into()),
     }
+}
+
+fn parse_moment(text: &str) -> Result<sightline_geometry::Moment, String> {
+    let parse = |text: &str| {
+        let (state, t) = text.split_once(',')?;
+        let t: f64 = t.trim().parse().ok()?;
+        let moment = sightline_geometry::Moment { state: state.trim().parse().ok()?, t };
+        (0.0..=1.0).contains(&t).then_some(moment)
+    };
+    parse(text).ok_or_else(|| "give a state and a share of it from 0 to 1: state,t".into())
 }
 
 fn parse_cell(text: &str) -> Result<CellId, String> {

@@ -112,7 +112,7 @@ impl Default for CellEffort {
 
 /// Where a row stands in a table of cells: by cell, the longest first, then by time. So the union of all
 /// states comes before the runs.
-pub(crate) type RowOrder = (CellId, Reverse<u32>, u32);
+pub type RowOrder = (CellId, Reverse<u32>, u32);
 
 /// See [`RowOrder`].
 pub(crate) const fn row_order(cell: CellId, states: &Range<u32>) -> RowOrder {
@@ -126,8 +126,9 @@ impl CellRow {
         self.first_state..self.last_state + 1
     }
 
-    /// Where the row stands in a table.
-    pub(crate) const fn order(&self) -> RowOrder {
+    /// Where the row stands in a table: rows are written in this order.
+    #[must_use]
+    pub const fn order(&self) -> RowOrder {
         row_order(self.cell.id, &self.states())
     }
 

@@ -153,12 +153,15 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Reads all cells.
+    /// Reads all cells; of each, the row of all states.
     pub async fn of(dataset: &Dataset) -> Result<Self> {
         let mut out = Self { primitives: dataset.manifest().scene.triangles, ..Self::default() };
         let (mut visible, mut error) = (0u64, 0.0f64);
         let mut rows = std::pin::pin!(dataset.cell_rows());
         while let Some(row) = rows.try_next().await? {
+            if row.states() != (0..dataset.states()) {
+                continue;
+            }
             let members = row.set.len();
             out.cells += 1;
             visible += members;
