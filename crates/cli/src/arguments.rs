@@ -30,7 +30,7 @@ pub struct Arguments {
 /// The commands.
 #[derive(Debug, Subcommand)]
 pub enum Task {
-    /// Write a deterministic benchmark scene as glTF.
+    /// Write a deterministic benchmark scene as glTF, or as a particle table.
     Generate(Generate),
     /// Bake the visible sets of a scene into a dataset, on this machine.
     Bake(Box<Bake>),
@@ -74,6 +74,10 @@ pub enum SceneKind {
     Town,
     /// A meadow of instanced grass and flowers.
     Grass,
+    /// The same meadow in the wind: every blade moves.
+    SwayingGrass,
+    /// Spheres that bounce on the ground until they rest, as a Parquet or CSV table.
+    BouncingSpheres,
 }
 
 /// `generate`.
@@ -81,14 +85,22 @@ pub enum SceneKind {
 pub struct Generate {
     /// What to generate.
     pub kind: SceneKind,
-    /// Triangles, instances counted: within 2 % of it. `200k` and `3.7M` are understood.
-    #[arg(long, default_value = "200k", value_name = "N", value_parser = parse_count)]
-    pub triangles: u64,
+    /// Triangles, instances counted: within 2 % of it. `200k` and `3.7M` are understood; 200k when
+    /// absent. Not for bouncing-spheres.
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub triangles: Option<u64>,
+    /// Spheres of bouncing-spheres; 10k when absent.
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub count: Option<u64>,
+    /// States of bouncing-spheres and swaying-grass: stretches of linear motion between two key
+    /// frames; 25 and 10 when absent.
+    #[arg(long, value_name = "K")]
+    pub states: Option<u32>,
     /// Scenes of the same kind, size and seed are the same, byte for byte.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// The file to write.
-    #[arg(short, long, value_name = "SCENE.glb")]
+    /// The file to write: SCENE.glb, or SCENE.parquet or SCENE.csv for bouncing-spheres.
+    #[arg(short, long, value_name = "SCENE")]
     pub out: PathBuf,
     /// Print one JSON object.
     #[arg(long)]

@@ -217,6 +217,14 @@ impl From<GenerateError> for Failure {
         match &error {
             GenerateError::Size { .. } => Self::new(Kind::Usage, error.to_string())
                 .with_help("give --triangles in that range"),
+            GenerateError::Spheres { .. } => {
+                Self::new(Kind::Usage, error.to_string()).with_help("give --count in that range")
+            }
+            GenerateError::States { .. } => {
+                Self::new(Kind::Usage, error.to_string()).with_help("give --states in that range")
+            }
+            GenerateError::Table(source) => Self::new(Kind::Store, format!("{error}: {source}"))
+                .with_help("check the rights and the free space of the folder"),
             GenerateError::Write(source) => Self::new(Kind::Store, format!("{error}: {source}"))
                 .with_help("check the rights and the free space of the folder"),
         }

@@ -306,7 +306,7 @@ pub struct InstancedGeometry {
     /// World box of everything at all key frames.
     pub bounds: Bounds,
     /// Largest `|M| |p|` over all instances and the vertices p of their meshes, M the linear part of
-    /// the transform, absolute values entry by entry; metres. A vertex is placed by products of
+    /// the transform, absolute values entry by entry, and over the particles; metres. A vertex is placed by products of
     /// that size, so it can be off by that many roundings even if the sum is close to the viewer:
     /// that is so for meshes that stand far from their own origin.
     pub placement_reach: f64,
@@ -370,6 +370,10 @@ impl InstancedGeometry {
         let placement_reach = instances
             .iter()
             .map(|i| placement_reach(&meshes[i.mesh.index()], i))
+            .chain(particles.iter().filter(|p| !p.bounds.is_empty()).map(|p| {
+                let (min, max) = (p.bounds.min - p.origin, p.bounds.max - p.origin);
+                min.abs().max(max.abs()).length()
+            }))
             .fold(0.0, f64::max);
         let origin = if bounds.is_empty() { DVec3::ZERO } else { bounds.center().round() };
         let relative =

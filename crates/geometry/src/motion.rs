@@ -75,6 +75,8 @@ pub struct MovingNode {
     pub first: u32,
     /// Number of items of a leaf, 0 for an inner node.
     pub count: u32,
+    /// Number of items below.
+    pub items: u32,
 }
 
 impl MovingNode {
@@ -116,11 +118,18 @@ impl MovingHierarchy {
         let means: Vec<Bounds32> = (0..items).map(|i| mean(keys, |key| box_of(i, key))).collect();
         let (tree, order) = Hierarchy::build(&means, leaf_items);
         drop(means);
-        let nodes: Vec<MovingNode> =
-            tree.nodes.iter().map(|n| MovingNode { first: n.first, count: n.count }).collect();
+        let node = |n: &crate::Node| MovingNode { first: n.first, count: n.count, items: n.count };
+        let mut nodes: Vec<MovingNode> = tree.nodes.iter().map(node).collect();
         drop(tree);
-        let mut boxes = vec![EMPTY; nodes.len() * keys];
         // Children lie behind their parent.
+        for n in (0..nodes.len()).rev() {
+            if nodes[n].is_leaf() {
+                continue;
+            }
+            let first = nodes[n].first as usize;
+            nodes[n].items = nodes[first].items + nodes[first + 1].items;
+        }
+        let mut boxes = vec![EMPTY; nodes.len() * keys];
         for (n, node) in nodes.iter().enumerate().rev() {
             for key in 0..keys {
                 let mut bounds = EMPTY;

@@ -10,10 +10,12 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use crate::particles::TableProblem;
+
 /// A scene that was refused.
 #[derive(Debug)]
 pub struct SceneError {
-    /// The main file of the scene.
+    /// The main file of the scene, or the particle table.
     pub file: PathBuf,
     /// The part of the scene that was being read.
     pub place: Place,
@@ -53,6 +55,10 @@ pub enum Cause {
         /// What the pattern parser says.
         reason: String,
     },
+
+    /// A particle table is refused.
+    #[error(transparent)]
+    Table(#[from] TableProblem),
 
     /// A GLB file ends before the length that it states.
     #[error("the GLB container is cut short: {what} needs {needed} bytes, {available} are there")]
@@ -353,6 +359,14 @@ pub enum Cause {
         /// The limit.
         limit: u64,
     },
+    /// More triangles and particles than primitive numbers.
+    #[error("the scene has {count} triangles and particles; the limit is {limit}")]
+    TooManyPrimitives {
+        /// Triangles, instances counted, and particles.
+        count: u64,
+        /// The limit.
+        limit: u64,
+    },
     /// More triangles in memory than the options allow.
     #[error("the scene has {count} unique triangles; the limit is {limit}")]
     TooManyUniqueTriangles {
@@ -437,9 +451,18 @@ impl From<Cause> for SceneError {
     }
 }
 
+impl From<TableProblem> for SceneError {
+    fn from(problem: TableProblem) -> Self {
+        Cause::from(problem).into()
+    }
+}
+
 impl SceneError {
+    /// Names the file, where none is named yet.
     pub(crate) fn in_file(mut self, file: &Path) -> Self {
-        self.file = file.to_path_buf();
+        if self.file.as_os_str().is_empty() {
+            self.file = file.to_path_buf();
+        }
         self
     }
 
@@ -459,8 +482,10 @@ impl SceneError {
     pub fn help(&self) -> Option<String> {
         let text = match &*self.cause {
             Cause::Read { .. } | Cause::NotAFile => {
-                "give the path of a .gltf or .glb file that this user can read".into()
+                "give the path of a .gltf, .glb, .parquet or .csv file that this user can read"
+                    .into()
             }
+            Cause::Table(problem) => problem.help().into(),
             Cause::Pattern { .. } => {
                 "patterns are globs: `*` and `**` match any text, `?` one character, `{a,b}` \
                  alternatives; write `[*]` for a literal star"
@@ -522,7 +547,7 @@ impl SceneError {
                     .into()
             }
             Cause::NodesTooDeep { .. } => "flatten the node hierarchy".into(),
-            Cause::TooManyTriangles { .. } => {
+            Cause::TooManyTriangles { .. } | Cause::TooManyPrimitives { .. } => {
                 "primitive numbers have 32 bits; split the world into several scenes".into()
             }
             Cause::TooManyUniqueTriangles { .. } | Cause::TooManyInstances { .. } => {

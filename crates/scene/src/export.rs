@@ -5,6 +5,9 @@
 //! cameras and lights, in standard glTF 2.0 that passes the Khronos validator when the source does.
 //! External and data-URI images are embedded. The bytes depend on source and set alone.
 //!
+//! Particles of the set are instances of a tessellated sphere, where they are at the first key frame. A
+//! scene of particles alone is exported as these.
+//!
 //! Left out: animations, skins (a skinned mesh stands where the reader saw it), morph targets
 //! (their weights at rest are applied to positions), other scenes than the default one, and what
 //! nothing visible refers to. Compressed data is written decompressed; strips and fans become lists.
@@ -21,6 +24,7 @@
 mod appearance;
 mod hierarchy;
 mod output;
+mod particles;
 mod source;
 mod subset;
 
@@ -29,7 +33,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value, json};
-use sightline_geometry::PrimitiveSet;
+use sightline_geometry::{Moment, PrimitiveSet, Run};
 
 use crate::gltf_reader::{buffers, container, document, uri};
 use crate::{Scene, SceneError};
@@ -39,9 +43,12 @@ use source::Source;
 /// What was exported.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ExportReport {
-    /// Triangles of the exported scene, counted once for every instance: those of the set.
+    /// Triangles of the exported scene, counted once for every instance: those of the set. Without
+    /// those of particles.
     pub triangles: u64,
-    /// Triangles in the file.
+    /// Particles of the exported scene: those of the set that are there.
+    pub particles: u64,
+    /// Triangles in the file, without those of particles.
     pub unique_triangles: u64,
     /// Size of the file.
     pub bytes: u64,
@@ -126,6 +133,9 @@ impl Warnings {
     }
 }
 
+/// The source of a scene that has no glTF file.
+const NO_TRIANGLES: &[u8] = br#"{ "asset": { "version": "2.0" }, "scene": 0, "scenes": [{}] }"#;
+
 /// Root extensions that refer to nothing which is renumbered.
 const ROOT_EXTENSIONS: [&str; 3] = ["KHR_lights_punctual", "KHR_xmp_json_ld", "KHR_xmp"];
 
@@ -151,13 +161,21 @@ pub fn export_visible(
     }
     let in_source = |e: SceneError| ExportError::from(e.in_file(source));
     let malformed = |reason: String| ExportError::Malformed { file: source.into(), reason };
-    let main =
-        std::fs::read(source).map_err(|source| in_source(crate::Cause::Read { source }.into()))?;
+    // What is exported of a table is in the scene.
+    let is_table = crate::particles::is_table(source);
+    let main = if is_table {
+        NO_TRIANGLES.to_vec()
+    } else {
+        std::fs::read(source).map_err(|source| in_source(crate::Cause::Read { source }.into()))?
+    };
     let parts = container::split(&main).map_err(in_source)?;
     let document = document::Document::parse(parts.json).map_err(in_source)?;
     let buffers =
         buffers::Buffers::load(source, &main, parts.binary, &document).map_err(in_source)?;
-    if buffers.digest() != scene.digest {
+    // Behind the files of the source, the digest lists the particle tables.
+    let files = scene.digest.files.len() - scene.particles.len();
+    let own = crate::SceneDigest::of_files(buffers.files().to_vec());
+    if own.files[usize::from(is_table)..] != scene.digest.files[..files] {
         return Err(ExportError::SourceChanged { file: source.into() });
     }
     let read = Source::new(parts.json, &buffers).map_err(|e| malformed(e.to_string()))?;
@@ -166,8 +184,14 @@ pub fn export_visible(
     let mut warnings = Warnings::default();
     let placed = subset::placed(scene, set);
     let mut meshes = subset::Meshes::new(&read, scene);
-    let nodes = hierarchy::build(&read, &placed, &mut meshes, &mut output, &mut warnings)
+    let mut nodes = hierarchy::build(&read, &placed, &mut meshes, &mut output, &mut warnings)
         .ok_or_else(|| malformed("its nodes or meshes are not as they were read".into()))?;
+    let balls =
+        particles::balls(scene, set, Moment::START, meshes.json.len(), &mut output, &mut warnings)
+            .ok_or_else(|| malformed("its particles are not as they were read".into()))?;
+    nodes.roots.extend(nodes.json.len()..nodes.json.len() + balls.nodes.len());
+    nodes.json.extend(balls.nodes);
+    meshes.json.extend(balls.mesh);
     let mut root = Map::new();
     root.insert("asset".into(), asset(&read.json["asset"]));
     let mut shown = scene_of(&read.json);
@@ -180,7 +204,8 @@ pub fn export_visible(
     let mut mesh_json = meshes.json;
     let looks = appearance::collect(&read, source, &mut mesh_json, &mut output, &mut warnings);
     let report = ExportReport {
-        triangles: set.len(),
+        triangles: triangles_of(scene, set),
+        particles: balls.count,
         unique_triangles: meshes.triangles,
         bytes: 0,
         nodes: root.get("nodes").and_then(Value::as_array).map_or(0, Vec::len),
@@ -200,6 +225,13 @@ pub fn export_visible(
 
     let bytes = write(&root, &output, out)?;
     Ok(ExportReport { bytes, warnings: warnings.sentences(), ..report })
+}
+
+/// Number of triangles in a set of a scene.
+fn triangles_of(scene: &Scene, set: &PrimitiveSet) -> u64 {
+    let end = scene.geometry.triangle_count();
+    let below = |run: &Run| u64::from(run.end.min(end).saturating_sub(run.first));
+    set.runs().iter().map(below).sum()
 }
 
 fn insert_list(root: &mut Map<String, Value>, name: &str, list: Vec<Value>) {

@@ -1,6 +1,7 @@
 //! What reading a scene found: counts, what was left out, and what deserves a look.
 
 use serde::Serialize;
+use sightline_geometry::ParticleSystem;
 
 /// Degenerate triangles that are listed for one glTF primitive; the count is complete.
 pub(crate) const LISTED_DEGENERATE_TRIANGLES: usize = 64;
@@ -38,16 +39,20 @@ pub struct IngestReport {
     pub copyright: Option<String>,
     /// Triangles in memory, without degenerate ones.
     pub unique_triangles: u64,
-    /// Triangles with every instance counted: the number of primitives.
+    /// Triangles with every instance counted: the number of primitives but particles.
     pub instanced_triangles: u64,
     /// Vertices in memory: those that a triangle uses.
     pub unique_vertices: u64,
-    /// Objects: nodes with at least one triangle.
+    /// Objects: nodes with at least one triangle, and particle tables.
     pub objects: u64,
     /// Bodies of triangles in memory.
     pub meshes: u64,
     /// Placements of them.
     pub instances: u64,
+    /// Particles of all tables.
+    pub particles: u64,
+    /// Particles that hide nothing.
+    pub see_through_particles: u64,
     /// Instanced triangles that hide nothing.
     pub see_through_triangles: u64,
     /// Triangles of zero area that were dropped, in all meshes in memory.
@@ -72,4 +77,15 @@ pub struct IngestReport {
     pub ignored_extensions: Vec<String>,
     /// What deserves a look, one sentence each.
     pub warnings: Vec<String>,
+}
+
+impl IngestReport {
+    /// Fills in the counts of particles.
+    pub(crate) fn count_particles(&mut self, systems: &[ParticleSystem]) {
+        let count = |occluder: bool| {
+            systems.iter().filter(|s| s.occluder == occluder).map(|s| s.len() as u64).sum::<u64>()
+        };
+        self.see_through_particles = count(false);
+        self.particles = self.see_through_particles + count(true);
+    }
 }

@@ -1,18 +1,24 @@
 //! A scene in memory: numbered geometry, and where each number comes from in the file.
 //!
 //! Invariants:
-//! - objects are in the order of [`crate::morton`] numbering, and their primitives are
-//!   contiguous: `objects[i].primitives.end == objects[i + 1].primitives.start`;
-//! - every object has at least one triangle;
-//! - `meshes` is parallel to `geometry.meshes`, `instances` to `geometry.instances`;
+//! - objects of triangles are in the order of [`crate::morton`] numbering, those of particles follow in
+//!   the order of their tables, and their primitives are contiguous:
+//!   `objects[i].primitives.end == objects[i + 1].primitives.start`;
+//! - every object has at least one primitive;
+//! - `meshes` is parallel to `geometry.meshes`, `instances` to `geometry.instances`, `particles` to
+//!   `geometry.particles`;
+//! - `key_times` ascends, and has one entry more than there are states, or one for a scene at rest;
 //! - every mesh has at least one triangle and one instance, and only vertices that a triangle
 //!   uses, in the order in which the hierarchy's triangles use them.
 
-use std::{ops::Range, path::Path};
+use std::{
+    ops::Range,
+    path::{Path, PathBuf},
+};
 
 use sightline_geometry::{Bounds, InstancedGeometry, ObjectId};
 
-use crate::{IngestReport, SceneDigest, SceneError, gltf_reader};
+use crate::{IngestReport, ParticleSource, SceneDigest, SceneError, gltf_reader, particles};
 
 /// How a scene is to be read.
 #[derive(Clone, Debug)]
@@ -25,26 +31,39 @@ pub struct OpenOptions {
     pub max_unique_triangles: u64,
     /// Refuse scenes with more instances than this. An instance takes about 300 bytes.
     pub max_instances: u64,
+    /// Particle tables (`.parquet`, `.csv`) that belong to the scene; see `schemas/particles-v1.md`.
+    /// Each becomes an object, named as its file without extension.
+    pub particles: Vec<PathBuf>,
+    /// Refuse scenes whose particle tables have more spheres than this: particles times key
+    /// frames, all tables together. A sphere takes 16 bytes.
+    pub max_spheres: u64,
 }
 
 impl Default for OpenOptions {
-    /// No see-through patterns, 2^28 unique triangles, 2^24 instances.
+    /// No see-through patterns, 2^28 unique triangles, 2^24 instances, no tables, 2^28 spheres.
     fn default() -> Self {
-        Self { see_through: Vec::new(), max_unique_triangles: 1 << 28, max_instances: 1 << 24 }
+        Self {
+            see_through: Vec::new(),
+            max_unique_triangles: 1 << 28,
+            max_instances: 1 << 24,
+            particles: Vec::new(),
+            max_spheres: 1 << 28,
+        }
     }
 }
 
-/// What the author named: a node with at least one triangle.
+/// What the author named: a node with at least one triangle, or a particle table.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {
     /// Its number: the index into [`Scene::objects`].
     pub id: ObjectId,
-    /// Name of the node, else of its mesh, else `#` and the node index.
+    /// Name of the node, else of its mesh, else `#` and the node index; of a table, its file name
+    /// without extension.
     pub name: String,
     /// Node names from the root down, joined by `/`; nodes without a name as `#` and their
-    /// index. Paths of more than 4096 bytes lose their beginning.
+    /// index. Paths of more than 4096 bytes lose their beginning. The name again for a table.
     pub path: String,
-    /// Index into the `nodes` of the file.
+    /// Index into the `nodes` of the file; [`particles::NO_NODE`] for a table.
     pub node: u32,
     /// Global numbers of its primitives.
     pub primitives: Range<u32>,
@@ -83,7 +102,7 @@ pub struct InstanceSource {
 /// A scene, read and numbered.
 #[derive(Clone, Debug)]
 pub struct Scene {
-    /// Triangles, instances and hierarchies.
+    /// Triangles, instances, particles and hierarchies.
     pub geometry: InstancedGeometry,
     /// Objects in the order of their numbers.
     pub objects: Vec<Object>,
@@ -91,6 +110,11 @@ pub struct Scene {
     pub meshes: Vec<MeshSource>,
     /// Parallel to the instances of `geometry`.
     pub instances: Vec<InstanceSource>,
+    /// Parallel to the particle systems of `geometry`.
+    pub particles: Vec<ParticleSource>,
+    /// Times of the key frames, seconds, ascending: one more than there are states; a single one
+    /// for a scene at rest.
+    pub key_times: Vec<f64>,
     /// What reading found.
     pub report: IngestReport,
     /// Hashes of the files.
@@ -98,13 +122,19 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Reads a `.gltf` or `.glb` file: the default scene, at rest.
+    /// Reads a `.gltf` or `.glb` file: the default scene, at rest; or a `.parquet` or `.csv` table of
+    /// particles. The tables of the options are added.
     ///
     /// # Errors
-    /// When the file cannot be read, breaks a rule of glTF that its triangles depend on, or is
+    /// When a file cannot be read, breaks a rule of its format that the geometry depends on, or is
     /// too large; see [`crate::Cause`].
     pub fn open(path: &Path, options: &OpenOptions) -> Result<Self, SceneError> {
-        gltf_reader::read(path, options).map_err(|e| e.in_file(path))
+        let read = if particles::is_table(path) {
+            particles::read_scene(path, options)
+        } else {
+            gltf_reader::read(path, options)
+        };
+        read.map_err(|e| e.in_file(path))
     }
 
     /// As [`Scene::open`], with the content of the main file in `main`; external buffers are
@@ -113,7 +143,12 @@ impl Scene {
     /// # Errors
     /// As [`Scene::open`].
     pub fn open_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Self, SceneError> {
-        gltf_reader::read_bytes(path, main, options).map_err(|e| e.in_file(path))
+        let read = if particles::is_table(path) {
+            particles::read_scene_bytes(path, main, options)
+        } else {
+            gltf_reader::read_bytes(path, main, options)
+        };
+        read.map_err(|e| e.in_file(path))
     }
 
     /// Panics when an invariant of the module does not hold.
@@ -125,11 +160,12 @@ impl Scene {
         for (i, object) in self.objects.iter().enumerate() {
             assert_eq!(object.id.index(), i);
             assert_eq!(object.primitives.start, next, "objects are contiguous");
-            assert!(!object.primitives.is_empty(), "objects have triangles");
+            assert!(!object.primitives.is_empty(), "objects have primitives");
             assert!(!object.bounds.is_empty());
             next = object.primitives.end;
         }
         assert_eq!(next, g.primitive_count());
+        self.assert_particles_well_formed();
         let mut placed = vec![false; g.meshes.len()];
         for instance in &g.instances {
             placed[instance.mesh.index()] = true;
@@ -155,6 +191,32 @@ impl Scene {
                 })
                 .collect();
             mesh.hierarchy.assert_well_formed(&boxes);
+        }
+    }
+
+    fn assert_particles_well_formed(&self) {
+        let g = &self.geometry;
+        assert!(self.key_times.is_sorted_by(|a, b| a < b), "key times ascend");
+        assert_eq!(particles::states(&self.key_times), g.states);
+        assert_eq!(self.particles.len(), g.particles.len());
+        let behind = self.objects.len() - self.particles.len();
+        for ((system, source), object) in
+            g.particles.iter().zip(&self.particles).zip(&self.objects[behind..])
+        {
+            assert_eq!(system.object, object.id);
+            assert_eq!(system.first_primitive.0, object.primitives.start);
+            assert_eq!(system.len(), object.primitives.len());
+            assert_eq!(system.occluder, object.occluder);
+            assert_eq!(object.node, particles::NO_NODE);
+            let mut ids = source.ids.clone();
+            ids.sort_unstable();
+            assert!(ids.is_sorted_by(|a, b| a < b), "a particle has one number");
+            assert_eq!(ids.len(), system.len());
+            let box_of = |i: usize, key: usize| system.keys[key][i].bounds();
+            system.hierarchy.assert_well_formed(system.len(), box_of);
+            let spheres = || system.keys.iter().flatten().filter(|s| s.is_present());
+            assert!(spheres().all(|s| s.radius > 0.0 && s.center().is_finite()));
+            assert!(spheres().next().is_some(), "a table has a sphere");
         }
     }
 }

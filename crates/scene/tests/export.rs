@@ -4,10 +4,10 @@
 mod fixtures;
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use fixtures::{
-    Corners, Fixture, assert_same_triangles, files_below, open, scenes, world_triangles,
+    Corners, Fixture, assert_same_triangles, assert_valid, files_below, open, scenes,
+    world_triangles,
 };
 use serde_json::{Value, json};
 use sightline_geometry::{PrimitiveId, PrimitiveSet, Run};
@@ -78,22 +78,6 @@ fn json_of(glb: &Path) -> Value {
     let bytes = std::fs::read(glb).unwrap();
     let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
     serde_json::from_slice(&bytes[20..20 + length]).unwrap()
-}
-
-/// Passes files to the Khronos validator; skips loudly where it is not installed.
-fn assert_valid(files: &[&Path]) {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/gltf-validator");
-    if !folder.join("node_modules/gltf-validator").is_dir() {
-        #[allow(clippy::print_stderr)]
-        {
-            eprintln!("SKIPPED: no validator; run `npm ci` in {}", folder.display());
-        }
-        return;
-    }
-    let output = Command::new("node").arg(folder.join("validate.mjs")).args(files).output();
-    let output = output.expect("the validator is installed, so node runs");
-    let text = String::from_utf8_lossy(&output.stdout);
-    assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
 }
 
 #[test]

@@ -15,13 +15,20 @@
 //! goes to the lower primitive number. A crossing is computed from the pair alone (over the whole
 //! stretch on which both exist), so it does not depend on what was inserted between.
 //!
+//! What moves or is round has an [`Arc`]; its line is the arc's chord, with how far the arc may be on
+//! either side of it. Where the chords do not decide, the arcs do: [`crate::arc::order`].
+//!
 //! Invariants ([`Envelopes::assert_well_formed`]):
 //! - pieces are sorted, disjoint, not empty, inside their bin (VI-1);
 //! - no piece is farther than its bin's far depth.
 
 use sightline_geometry::UNIT_ROUNDOFF;
 
-use crate::{bounds::ErrorBounds, cut::Cut};
+use crate::{
+    arc::{Arc, Curve, Order, order},
+    bounds::ErrorBounds,
+    cut::Cut,
+};
 
 /// Bins over t of a pixel. Eight let a 10 m segment see past a street corner bin by bin, and keep
 /// the lists of a city two or three pieces long.
@@ -81,11 +88,21 @@ pub struct Line {
     /// Least depth, metres.
     pub near: f64,
     far: f64,
-    /// Largest error of a depth, metres.
-    pub error: f64,
+    /// No depth is less than that of the line by more, metres.
+    pub below: f64,
+    /// No depth is larger than that of the line by more, metres.
+    pub above: f64,
     /// Global number of the primitive.
     pub primitive: u32,
+    /// Number of its arc, [`STRAIGHT`] for a line.
+    arc: u32,
 }
+
+/// The arc of a line that is straight.
+const STRAIGHT: u32 = u32::MAX;
+
+/// The arc of a chord whose arc is in no list.
+const UNLISTED: u32 = u32::MAX - 1;
 
 impl Line {
     /// The cut seen at a column, where its ends (a, b) are seen at `times`, which differ.
@@ -104,8 +121,29 @@ impl Line {
             slope,
             near,
             far,
-            error,
+            below: error,
+            above: error,
             primitive: cut.primitive,
+            arc: STRAIGHT,
+        }
+    }
+
+    /// The chord of an arc that covers `start..end`, which is not empty.
+    #[must_use]
+    pub fn of_arc(arc: &Arc, start: f64, end: f64, primitive: u32) -> Self {
+        let band = arc.band(start, end);
+        Self {
+            start,
+            end,
+            t: start,
+            z: band.z0,
+            slope: (band.z1 - band.z0) / (end - start),
+            near: least(band.z0, band.z1),
+            far: largest(band.z0, band.z1),
+            below: band.below + band.error,
+            above: band.above + band.error,
+            primitive,
+            arc: UNLISTED,
         }
     }
 
@@ -121,7 +159,7 @@ impl Line {
     #[inline(always)]
     fn farthest(&self, s: f64, e: f64) -> f64 {
         let far = largest(self.depth(s), self.depth(e));
-        far + self.error + 4.0 * UNIT_ROUNDOFF * far
+        far + self.above + 4.0 * UNIT_ROUNDOFF * far
     }
 }
 
@@ -129,8 +167,7 @@ impl Line {
 #[inline(always)]
 fn compare(a: &Line, b: &Line, t: f64) -> i32 {
     let difference = a.depth(t) - b.depth(t);
-    let bound = a.error + b.error;
-    i32::from(difference > bound) - i32::from(difference < -bound)
+    i32::from(difference > a.below + b.above) - i32::from(difference < -(a.above + b.below))
 }
 
 /// Who is nearer on a stretch.
@@ -140,12 +177,21 @@ enum Nearer {
     Old,
     NewThenOld(f64),
     OldThenNew(f64),
+    /// The chords do not tell: see [`order`].
+    Unknown,
 }
 
 /// Decides between two lines on `s..e`. `tie` is true when the new one wins a tie.
 #[inline(always)]
 fn decide(new: &Line, old: &Line, s: f64, e: f64, tie: bool) -> Nearer {
     let (at_s, at_e) = (compare(new, old, s), compare(new, old, e));
+    if (new.arc & old.arc) != STRAIGHT {
+        return match (at_s, at_e) {
+            (-1, -1) => Nearer::New,
+            (1, 1) => Nearer::Old,
+            _ => Nearer::Unknown,
+        };
+    }
     if at_s == 0 && at_e == 0 {
         return if tie { Nearer::New } else { Nearer::Old };
     }
@@ -172,6 +218,30 @@ struct Piece {
     line: u32,
 }
 
+/// A visibility interval: a stretch of t on which a primitive is nearest at a pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Interval {
+    /// The primitive.
+    pub primitive: u32,
+    /// Start, in [0, 1).
+    pub start: f64,
+    /// End, in (0, 1].
+    pub end: f64,
+    /// Largest error of the start: that of the primitive's own end, or of what it meets there.
+    pub start_error: f64,
+    /// Largest error of the end.
+    pub end_error: f64,
+}
+
+impl Interval {
+    /// True when it is longer than what its ends may be off by: rounding alone makes nothing visible.
+    #[inline(always)]
+    #[must_use]
+    pub fn counts(&self) -> bool {
+        self.end - self.start > self.start_error + self.end_error
+    }
+}
+
 /// Where the pieces of a bin are.
 #[derive(Clone, Copy, Debug, Default)]
 struct Bin {
@@ -181,9 +251,10 @@ struct Bin {
 }
 
 /// The lists of a tile's pixels.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub struct Envelopes {
     lines: Vec<Line>,
+    arcs: Vec<Arc>,
     pieces: Vec<Piece>,
     /// `pixel * BINS + bin`.
     bins: Vec<Bin>,
@@ -221,11 +292,71 @@ fn push(out: &mut Vec<Piece>, lines: &[Line], t0: f64, t1: f64, line: u32) {
     }
 }
 
+/// The curve of a line.
+fn curve<'a>(line: &'a Line, arcs: &'a [Arc]) -> Curve<'a> {
+    Curve { line, arc: arcs.get(line.arc as usize) }
+}
+
+/// Who of a new line and an old one is nearer, for pairs with an arc: for each stretch of `s..e`
+/// `each(from, to, whether the new one is)`. `tie` is true when the new one wins a tie.
+fn by_order(
+    new: Curve,
+    old: Curve,
+    (s, e): (f64, f64),
+    tie: bool,
+    mut each: impl FnMut(f64, f64, bool),
+) {
+    // From the lower to the higher number, so that the result does not depend on who was first.
+    let new_first = new.line.primitive < old.line.primitive;
+    let (a, b) = if new_first { (new, old) } else { (old, new) };
+    let Order { first, count, changes } = order(a, b, tie == new_first);
+    let (mut is_new, mut from) = (first == new_first, s);
+    for &change in &changes[..count] {
+        if change > from && change < e {
+            each(from, change, is_new);
+            from = change;
+        }
+        if change < e {
+            is_new = !is_new;
+        }
+    }
+    each(from, e, is_new);
+}
+
+/// Puts what is left of `piece` and what a new line takes of its stretch `s..e` behind the scratch
+/// pieces, where the arcs decide; whether it takes anything.
+#[cold]
+#[inline(never)]
+fn by_arcs(
+    lines: &[Line],
+    arcs: &[Arc],
+    scratch: &mut Vec<Piece>,
+    new: u32,
+    piece: Piece,
+    (s, e): (f64, f64),
+) -> bool {
+    let of = |line: u32| curve(&lines[line as usize], arcs);
+    let tie = lines[new as usize].primitive < lines[piece.line as usize].primitive;
+    let mut won = false;
+    by_order(of(new), of(piece.line), (s, e), tie, |_, _, is_new| won |= is_new);
+    if !won {
+        scratch.push(piece);
+        return false;
+    }
+    push(scratch, lines, piece.t0, s, piece.line);
+    by_order(of(new), of(piece.line), (s, e), tie, |from, to, is_new| {
+        push(scratch, lines, from, to, if is_new { new } else { piece.line });
+    });
+    push(scratch, lines, e, piece.t1, piece.line);
+    true
+}
+
 impl Envelopes {
     /// Empties the lists and makes room for `pixels`.
     pub fn clear(&mut self, pixels: usize) {
         let bins = pixels * BINS;
         self.lines.clear();
+        self.arcs.clear();
         self.bins.clear();
         self.bins.extend((0..bins as u32).map(|i| Bin {
             first: i * FIRST_CAPACITY,
@@ -238,11 +369,33 @@ impl Envelopes {
         self.far.resize(pixels, [f64::INFINITY; BINS]);
     }
 
+    /// Takes over the lists of `other`; keeps its memory.
+    pub fn copy_from(&mut self, other: &Self) {
+        self.lines.clone_from(&other.lines);
+        self.arcs.clone_from(&other.arcs);
+        self.pieces.clone_from(&other.pieces);
+        self.bins.clone_from(&other.bins);
+        self.far.clone_from(&other.far);
+    }
+
     /// The far depths of a pixel, a bin each.
     #[inline(always)]
     #[must_use]
     pub fn far(&self, pixel: usize) -> &[f64; BINS] {
         &self.far[pixel]
+    }
+
+    /// Inserts the part of an arc that covers `line.start..line.end` (inside [0, 1], not empty), with
+    /// its chord `line`. Returns whether it is nearest anywhere.
+    pub fn insert_arc(&mut self, pixel: usize, line: Line, arc: Arc) -> bool {
+        let number = self.arcs.len() as u32;
+        self.arcs.push(arc);
+        let (a, b) = (line.start, line.end);
+        let won = self.insert(pixel, Line { arc: number, ..line }, a, b);
+        if !won {
+            self.arcs.pop();
+        }
+        won
     }
 
     /// Inserts a line that covers `a..b` (inside [0, 1], not empty) into a pixel's list. Returns
@@ -252,7 +405,7 @@ impl Envelopes {
         let number = self.lines.len() as u32;
         self.lines.push(line);
         let mut won = false;
-        let near = line.near - line.error;
+        let near = line.near - line.below;
         for bin in bin_of(a)..=bin_of(b) {
             let (start, end) = stretch(bin);
             let (s, e) = (largest(a, start), least(b, end));
@@ -294,7 +447,9 @@ impl Envelopes {
             let old_line = &lines[piece.line as usize];
             let tie = new_line.primitive < old_line.primitive;
             let nearer = decide(new_line, old_line, s, e, tie);
-            if nearer == Nearer::Old {
+            if nearer == Nearer::Unknown {
+                won |= by_arcs(lines, &self.arcs, scratch, new, piece, (s, e));
+            } else if nearer == Nearer::Old {
                 scratch.push(piece);
             } else {
                 won = true;
@@ -370,38 +525,74 @@ impl Envelopes {
         &self.pieces[bin.first as usize..(bin.first + bin.len) as usize]
     }
 
-    /// Calls `found(primitive, length)` for every interval of a pixel, in order of t; pieces of a
-    /// line that meet at the border of two bins are one interval.
+    /// Calls `found` with every interval of a pixel, in order of t; pieces of a line that meet at the
+    /// border of two bins are one interval. `time_error` is that of the ends of lines at this column.
     #[inline(always)]
-    pub fn intervals(&self, pixel: usize, mut found: impl FnMut(u32, f64)) {
+    pub fn intervals(&self, pixel: usize, time_error: f64, mut found: impl FnMut(Interval)) {
+        let error_of = |line: u32| match self.arcs.get(self.lines[line as usize].arc as usize) {
+            Some(arc) => largest(arc.time_error, time_error),
+            None => time_error,
+        };
         let mut open = Piece::default();
+        // The error of what is before the open piece, where both meet.
+        let mut before = time_error;
+        let mut close = |open: &Piece, before: f64, behind: f64| {
+            let own = error_of(open.line);
+            found(Interval {
+                primitive: self.lines[open.line as usize].primitive,
+                start: open.t0,
+                end: open.t1,
+                start_error: largest(own, before),
+                end_error: largest(own, behind),
+            });
+            own
+        };
         for bin in 0..BINS {
             for piece in self.of(pixel * BINS + bin) {
                 if piece.line == open.line && piece.t0 == open.t1 {
                     open.t1 = piece.t1;
                 } else {
+                    let meets = piece.t0 == open.t1;
+                    let mut passed = time_error;
                     if open.t0 < open.t1 {
-                        found(self.lines[open.line as usize].primitive, open.t1 - open.t0);
+                        let behind = if meets { error_of(piece.line) } else { time_error };
+                        passed = close(&open, before, behind);
                     }
+                    before = if meets { passed } else { time_error };
                     open = *piece;
                 }
             }
         }
         if open.t0 < open.t1 {
-            found(self.lines[open.line as usize].primitive, open.t1 - open.t0);
+            close(&open, before, time_error);
         }
     }
 
     /// Length of the part of `a..b` on which a line is not behind a pixel's list: what is seen of
-    /// a see-through cut. The list does not change.
+    /// a see-through cut, with its arc if it has one. The list does not change.
     #[must_use]
-    pub fn unhidden_length(&self, pixel: usize, line: &Line, a: f64, b: f64) -> f64 {
+    pub fn unhidden_length(
+        &self,
+        pixel: usize,
+        line: &Line,
+        arc: Option<&Arc>,
+        (a, b): (f64, f64),
+    ) -> f64 {
         let mut hidden = 0.0;
         for bin in bin_of(a)..=bin_of(b) {
             for piece in self.of(pixel * BINS + bin) {
                 let (s, e) = (largest(piece.t0, a), least(piece.t1, b));
                 if s < e {
-                    hidden += match decide(line, &self.lines[piece.line as usize], s, e, true) {
+                    let old = &self.lines[piece.line as usize];
+                    hidden += match decide(line, old, s, e, true) {
+                        Nearer::Unknown => {
+                            let mut hidden = 0.0;
+                            let curves = (Curve { line, arc }, curve(old, &self.arcs));
+                            by_order(curves.0, curves.1, (s, e), true, |from, to, is_new| {
+                                hidden += if is_new { 0.0 } else { to - from };
+                            });
+                            hidden
+                        }
                         Nearer::New => 0.0,
                         Nearer::Old => e - s,
                         Nearer::NewThenOld(t) => e - t,

@@ -20,13 +20,19 @@
 //! [`mod@reference`] solves the same definition in exact rational arithmetic, with no culling and no
 //! floats; the tests compare the two.
 
+pub mod arc;
+pub mod bernstein;
 pub mod bounds;
 pub mod cut;
 pub mod envelope;
+mod lists;
+pub mod moving;
+pub mod quadratic;
 pub mod reference;
 mod segment;
 mod states;
 mod tile;
 
+pub use lists::{Pixel, visit_intervals};
 pub use segment::{SegmentVisibility, SolveOptions, Statistics, solve_segment, solve_segment_with};
 pub use states::{Known, StateVisibility, TimePath, solve_states};

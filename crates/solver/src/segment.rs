@@ -9,6 +9,11 @@
 //! that is near is large, that is nothing, and one pass is enough; a far facade, finer than the
 //! rays are spaced, is refined until it is not.
 //!
+//! Over several states, each state is solved as if it were alone: what is refined for it depends on what
+//! is seen in it. What is seen of what rests is shared. A tile's result is that of the resting scene for
+//! all states in which nothing that moves is seen there, and finds are kept with the set of states they
+//! are of, as bits.
+//!
 //! Source of the estimate: Good, "The population frequencies of species and the estimation of
 //! population parameters" (Biometrika 1953).
 //!
@@ -19,14 +24,18 @@
 //!   divided between it and the finer rays around it.
 
 use rayon::prelude::*;
+use std::ops::Range;
+
 use sightline_geometry::{
-    FACE_COUNT, InstancedGeometry, PrimitiveId, PrimitiveSet, RectifiedFrame, Sampling, ViewSegment,
+    FACE_COUNT, InstancedGeometry, PrimitiveId, PrimitiveSet, RectifiedFrame, Sampling, StateSets,
+    ViewSegment,
 };
 
 use crate::{
     bounds::ErrorBounds,
     envelope::Column,
-    tile::{TILE_COLUMNS, TILE_ROWS, TileContext, TileCounters, TileSolver},
+    states::{StateVisibility, TimePath},
+    tile::{Motion, TILE_COLUMNS, TILE_ROWS, TileContext, TileCounters, TileSolver, When},
 };
 
 /// Weights are summed in units of 2^-60 of the whole (directions x segment), as integers: the
@@ -66,7 +75,16 @@ pub struct SolveOptions<'a> {
     pub known: Option<&'a PrimitiveSet>,
     /// Do without the instructions that only some processors have. The result is the same.
     pub portable: bool,
+    /// Do without temporal bounding volumes: what moves is looked at in every state. The result is the
+    /// same.
+    pub without_volumes: bool,
 }
+
+/// States that are solved together: the bits of a [`States`].
+const STATES_AT_ONCE: u32 = u64::BITS;
+
+/// A set of states, counted from the first of those that are solved together.
+type States = u64;
 
 /// A tile of a pass's grid.
 #[derive(Clone, Copy, Debug)]
@@ -77,17 +95,24 @@ struct Tile {
     column: u32,
     /// Share of its directions that the tile and what refines it weigh.
     share: f64,
+    /// States that it is solved for.
+    states: States,
 }
 
-/// A primitive in a tile.
-#[derive(Clone, Copy, Debug)]
+/// A primitive in a tile, or in several.
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Find {
     primitive: u32,
     /// Rays that see it.
     rays: u32,
+    /// States in which they do.
+    states: States,
     /// Share of (directions x segment) on which they do, units of [`WEIGHT_UNIT`].
     weight: u64,
 }
+
+/// What the rays of a tile see, by primitive; a primitive once for each set of states.
+type Finds = Vec<Find>;
 
 /// The grid of one pass.
 struct Grid {
@@ -110,27 +135,34 @@ impl Grid {
     }
 
     /// The tiles of all faces.
-    fn all_tiles(&self) -> Vec<Tile> {
+    fn all_tiles(&self, states: States) -> Vec<Tile> {
         let (rows, columns) = self.tiles();
         (0..FACE_COUNT)
             .flat_map(|face| (0..rows).map(move |row| (face, row)))
             .flat_map(|(face, row)| {
-                (0..columns).map(move |column| Tile { face, row, column, share: 1.0 })
+                (0..columns).map(move |column| Tile { face, row, column, share: 1.0, states })
             })
             .collect()
     }
 
     /// The tiles of this grid inside a tile of the grid with half the rows and columns.
-    fn inside(&self, tile: &Tile, share: f64) -> impl Iterator<Item = Tile> {
+    fn inside(&self, tile: &Tile, share: f64, states: States) -> impl Iterator<Item = Tile> {
         let (rows, columns) = self.tiles();
         let Tile { face, row, column, .. } = *tile;
         (2 * row..rows.min(2 * row + 2))
             .flat_map(move |row| (2 * column..columns.min(2 * column + 2)).map(move |c| (row, c)))
-            .map(move |(row, column)| Tile { face, row, column, share })
+            .map(move |(row, column)| Tile { face, row, column, share, states })
     }
 
-    /// What a tile's rays see, ascending.
-    fn solve(&self, context: &TileContext, solver: &mut TileSolver, tile: &Tile) -> Vec<Find> {
+    /// What a tile's rays see, ascending. `time` is the first of the states that are solved together,
+    /// and how camera and time are coupled.
+    fn solve(
+        &self,
+        context: &TileContext,
+        solver: &mut TileSolver,
+        tile: &Tile,
+        time: Option<(u32, TimePath, bool)>,
+    ) -> Finds {
         let sampling = self.sampling;
         let first_row = tile.row * TILE_ROWS as u32;
         let first_column = tile.column * TILE_COLUMNS as u32;
@@ -138,41 +170,110 @@ impl Grid {
         let rows: Vec<f64> = (first_row..end_row).map(|i| sampling.row(i)).collect();
         let columns = &self.columns[first_column as usize..][..TILE_COLUMNS];
         let angles = solid_angles(sampling, first_row..end_row, first_column);
+        let first_state = time.map_or(0, |t| t.0);
+        let numbers: Vec<u32> = members(tile.states).map(|bit| first_state + bit).collect();
+        let motion = time.map(|(_, path, volumes)| Motion { states: &numbers, path, volumes });
         // (primitive, pixel) in one number, to sort by both at once.
         let mut seen: Vec<(u64, u64)> = Vec::new();
-        solver.solve(context, &rows, columns, |primitive, pixel, length| {
+        let mut current = When::Always;
+        let mut finds = Finds::new();
+        // Where the finds of the state before begin.
+        let (mut begin, mut own_states) = (0, 0);
+        solver.solve(context, &rows, columns, motion, |when, primitive, pixel, length| {
+            if when != current {
+                flush(&mut seen, current, first_state, &mut finds, &mut begin, &mut own_states);
+                current = when;
+            }
             let weight = (length * angles[pixel] * WEIGHT_UNIT) as u64;
             seen.push((u64::from(primitive) << 32 | pixel as u64, weight));
         });
-        seen.sort_unstable_by_key(|s| s.0);
-        let mut finds: Vec<Find> = Vec::new();
-        let mut last = u64::MAX;
-        for (key, weight) in seen {
-            let primitive = (key >> 32) as u32;
-            let rays = u32::from(key != last);
-            last = key;
-            match finds.last_mut() {
-                Some(find) if find.primitive == primitive => {
-                    find.rays += rays;
-                    find.weight = find.weight.saturating_add(weight);
-                }
-                _ => finds.push(Find { primitive, rays, weight }),
+        flush(&mut seen, current, first_state, &mut finds, &mut begin, &mut own_states);
+        // What rests is seen in the states that have nothing of their own.
+        let others = tile.states & !own_states;
+        for find in &mut finds {
+            if find.states == 0 {
+                find.states = others;
             }
         }
+        finds.retain(|find| find.states != 0);
+        finds.sort_by_key(|find| find.primitive);
         finds
     }
 }
 
-/// Sorts by primitive, and adds up what is of equal ones.
-fn join<T: Copy>(finds: &mut Vec<(u32, T)>, add: impl Fn(T, T) -> T) {
-    finds.sort_unstable_by_key(|f| f.0);
+/// The members of a set of states, ascending.
+fn members(states: States) -> impl Iterator<Item = u32> {
+    (0..STATES_AT_ONCE).filter(move |bit| states >> bit & 1 == 1)
+}
+
+/// Adds what was seen in a state, or always (without states yet), to the finds. Equal results of
+/// states that follow each other become one.
+fn flush(
+    seen: &mut Vec<(u64, u64)>,
+    when: When,
+    first_state: u32,
+    finds: &mut Finds,
+    begin: &mut usize,
+    own: &mut States,
+) {
+    let states = match when {
+        When::Always => 0,
+        When::In(state) => 1 << (state - first_state),
+    };
+    *own |= states;
+    seen.sort_unstable_by_key(|s| s.0);
+    let start = finds.len();
+    let mut last = u64::MAX;
+    for (key, weight) in seen.drain(..) {
+        let primitive = (key >> 32) as u32;
+        let rays = u32::from(key != last);
+        last = key;
+        match finds[start..].last_mut() {
+            Some(find) if find.primitive == primitive => {
+                find.rays += rays;
+                find.weight = find.weight.saturating_add(weight);
+            }
+            _ => finds.push(Find { primitive, rays, states, weight }),
+        }
+    }
+    let equal = |(a, b): (&Find, &Find)| {
+        (a.primitive, a.rays, a.weight) == (b.primitive, b.rays, b.weight) && a.states != 0
+    };
+    let (before, new) = finds[*begin..].split_at(start - *begin);
+    if states != 0 && before.len() == new.len() && before.iter().zip(new).all(equal) {
+        finds.truncate(start);
+        finds[*begin..].iter_mut().for_each(|find| find.states |= states);
+    } else {
+        *begin = start;
+    }
+}
+
+/// Sorts by primitive and states, and adds up what is of equal ones.
+fn join(finds: &mut Finds) {
+    finds.sort_unstable_by_key(|f| (f.primitive, f.states));
     finds.dedup_by(|b, a| {
-        let same = a.0 == b.0;
+        let same = (a.primitive, a.states) == (b.primitive, b.states);
         if same {
-            a.1 = add(a.1, b.1);
+            a.rays = a.rays.saturating_add(b.rays);
+            a.weight = a.weight.saturating_add(b.weight);
         }
         same
     });
+}
+
+/// The finds of one primitive at a time.
+fn by_primitive(finds: &[Find]) -> impl Iterator<Item = &[Find]> {
+    finds.chunk_by(|a, b| a.primitive == b.primitive)
+}
+
+/// The states in which exactly one ray sees a primitive, from its finds.
+fn seen_once(finds: &[Find]) -> States {
+    let (mut once, mut more) = (0, 0);
+    for find in finds.iter().filter(|find| find.rays > 0) {
+        more |= if find.rays > 1 { find.states } else { once & find.states };
+        once |= find.states;
+    }
+    once & !more
 }
 
 /// Finds the primitives visible from a segment, along the rays of `sampling`.
@@ -189,7 +290,7 @@ pub fn solve_segment(
 }
 
 /// Finds the primitives visible from a segment, along the rays of `sampling` and finer ones where
-/// `options` ask for them.
+/// `options` ask for them. What moves is as it is at the first key frame.
 #[must_use]
 pub fn solve_segment_with(
     geometry: &InstancedGeometry,
@@ -197,65 +298,182 @@ pub fn solve_segment_with(
     sampling: Sampling,
     options: &SolveOptions,
 ) -> SegmentVisibility {
-    let Some(frame) = RectifiedFrame::new(segment) else { return SegmentVisibility::default() };
-    let bounds = ErrorBounds::new(geometry, &frame);
-    let threshold = (options.threshold.clamp(0.0, 1.0) * WEIGHT_UNIT) as u64;
+    let path = TimePath::stopped(0.0);
+    let known = options.known.map(|set| StateSets::constant(0..1, set.clone()));
+    let solve = Solve { geometry, segment, sampling, states: 0..1, path, known: known.as_ref() };
+    let mut found = solve.run(options);
+    found.pop().map(|run| run.visibility).unwrap_or_default()
+}
 
-    let mut grid = Grid::new(sampling, &frame, &bounds);
-    let mut tiles = grid.all_tiles();
-    let mut statistics = TileCounters::default();
-    // Rays that see a primitive, and its weight; ascending.
-    let mut rays: Vec<(u32, u32)> = Vec::new();
-    let mut weights: Vec<(u32, u64)> = Vec::new();
-    let mut missing = 0.0;
-    for pass in 0..=options.passes {
-        let solved: Vec<(Vec<Find>, TileCounters)> = tiles
-            .par_iter()
-            .with_min_len(TILES_AT_ONCE)
-            .map_init(TileSolver::default, |solver, tile| {
-                solver.counters = TileCounters::default();
-                solver.portable = options.portable;
-                let face = frame.face(tile.face);
-                let context = TileContext { geometry, frame: &frame, face, bounds: &bounds };
-                let finds = grid.solve(&context, solver, tile);
-                (finds, solver.counters)
-            })
-            .collect();
-        for (finds, counters) in &solved {
-            statistics = statistics.plus(*counters);
-            rays.extend(finds.iter().map(|f| (f.primitive, f.rays)));
-        }
-        join(&mut rays, u32::saturating_add);
-        let seen_once = |find: &&Find| {
-            find.rays == 1
-                && rays.binary_search_by_key(&find.primitive, |r| r.0).is_ok_and(|k| rays[k].1 == 1)
-                && !options.known.is_some_and(|k| k.contains(PrimitiveId(find.primitive)))
-        };
-        let finer = Grid::new(grid.sampling.finer(), &frame, &bounds);
-        let mut next = Vec::new();
-        for (tile, (finds, _)) in tiles.iter().zip(&solved) {
-            let alone: u64 = finds.iter().filter(seen_once).map(|f| f.weight).sum();
-            let mut share = tile.share;
-            if pass < options.passes && alone > threshold {
-                // One ray of five; the other four are in the four tiles inside.
-                next.extend(finer.inside(tile, 0.8 * share));
-                share *= 0.2;
-            } else {
-                missing += alone as f64 / WEIGHT_UNIT;
+/// What is solved: at most [`STATES_AT_ONCE`] states of a segment.
+pub(crate) struct Solve<'a> {
+    pub geometry: &'a InstancedGeometry,
+    pub segment: &'a ViewSegment,
+    pub sampling: Sampling,
+    pub states: Range<u32>,
+    pub path: TimePath,
+    pub known: Option<&'a StateSets>,
+}
+
+impl Solve<'_> {
+    /// Most states of one solve.
+    pub(crate) const MOST: u32 = STATES_AT_ONCE;
+
+    /// Runs of states with equal results, ascending; none for a segment without length.
+    pub(crate) fn run(&self, options: &SolveOptions) -> Vec<StateVisibility> {
+        let Self { geometry, segment, sampling, ref states, path, known } = *self;
+        let Some(frame) = RectifiedFrame::new(segment) else { return Vec::new() };
+        let bounds = ErrorBounds::new(geometry, &frame);
+        let threshold = (options.threshold.clamp(0.0, 1.0) * WEIGHT_UNIT) as u64;
+        let count = states.end - states.start;
+        let all: States = States::MAX >> (STATES_AT_ONCE - count);
+        let moves = geometry.has_motion() || !geometry.particles.is_empty();
+        let time = moves.then_some((states.start, path, !options.without_volumes));
+        let known_in = |primitive: u32| -> States {
+            let Some(known) = known else { return 0 };
+            let mut bits = 0;
+            for (run, set) in known.runs() {
+                if set.contains(PrimitiveId(primitive)) {
+                    for state in run.start.max(states.start)..run.end.min(states.end) {
+                        bits |= 1 << (state - states.start);
+                    }
+                }
             }
-            weights.extend(finds.iter().map(|f| (f.primitive, (f.weight as f64 * share) as u64)));
+            bits
+        };
+
+        let mut grid = Grid::new(sampling, &frame, &bounds);
+        let mut tiles = grid.all_tiles(all);
+        let mut statistics = TileCounters::default();
+        // Rays that see a primitive, and its weight; ascending.
+        let mut found = Finds::new();
+        let mut missing = vec![0.0; count as usize];
+        for pass in 0..=options.passes {
+            let solved: Vec<(Finds, TileCounters)> = tiles
+                .par_iter()
+                .with_min_len(TILES_AT_ONCE)
+                .map_init(TileSolver::default, |solver, tile| {
+                    solver.counters = TileCounters::default();
+                    solver.portable = options.portable;
+                    let face = frame.face(tile.face);
+                    let context = TileContext { geometry, frame: &frame, face, bounds: &bounds };
+                    let finds = grid.solve(&context, solver, tile, time);
+                    (finds, solver.counters)
+                })
+                .collect();
+            // Weights are added when it is known what share of its directions a tile weighs.
+            for (finds, counters) in &solved {
+                statistics = statistics.plus(*counters);
+                found.extend(finds.iter().map(|f| Find { weight: 0, ..*f }));
+            }
+            join(&mut found);
+            let mut alone_in: Vec<(u32, States)> = Vec::new();
+            for of_one in by_primitive(&found) {
+                let states = seen_once(of_one);
+                if states != 0 {
+                    let primitive = of_one[0].primitive;
+                    alone_in.push((primitive, states & !known_in(primitive)));
+                }
+            }
+            let finer = Grid::new(grid.sampling.finer(), &frame, &bounds);
+            let mut next = Vec::new();
+            let mut alone = vec![0u64; count as usize];
+            for (tile, (finds, _)) in tiles.iter().zip(&solved) {
+                alone.fill(0);
+                for find in finds.iter().filter(|f| f.rays == 1) {
+                    let at = alone_in.binary_search_by_key(&find.primitive, |a| a.0);
+                    let states = at.map_or(0, |k| alone_in[k].1 & find.states);
+                    members(states).for_each(|bit| alone[bit as usize] += find.weight);
+                }
+                let mut refined: States = 0;
+                for bit in members(tile.states) {
+                    let alone = alone[bit as usize];
+                    if pass < options.passes && alone > threshold {
+                        refined |= 1 << bit;
+                    } else {
+                        missing[bit as usize] += alone as f64 / WEIGHT_UNIT;
+                    }
+                }
+                // One ray of five; the other four are in the four tiles inside.
+                if refined != 0 {
+                    next.extend(finer.inside(tile, 0.8 * tile.share, refined));
+                }
+                for find in finds {
+                    let shares = [(!refined, tile.share), (refined, 0.2 * tile.share)];
+                    for (states, share) in shares.map(|(s, share)| (s & find.states, share)) {
+                        if states != 0 {
+                            let weight = (find.weight as f64 * share) as u64;
+                            found.push(Find { rays: 0, states, weight, ..*find });
+                        }
+                    }
+                }
+            }
+            join(&mut found);
+            if next.is_empty() {
+                break;
+            }
+            (grid, tiles) = (finer, next);
         }
-        join(&mut weights, u64::saturating_add);
-        if next.is_empty() {
-            break;
-        }
-        (grid, tiles) = (finer, next);
+        runs(&found, states, &missing, statistics)
     }
-    SegmentVisibility {
-        set: PrimitiveSet::from_sorted(weights.iter().map(|f| f.0)),
-        weights: weights.iter().map(|f| (f.1 as f64 / WEIGHT_UNIT) as f32).collect(),
-        missing,
-        statistics,
+}
+
+/// Finds as runs of states with equal results.
+fn runs(
+    found: &[Find],
+    states: &Range<u32>,
+    missing: &[f64],
+    statistics: TileCounters,
+) -> Vec<StateVisibility> {
+    // Bit k: something differs between states k and k + 1.
+    let mut differs = 0;
+    for find in found {
+        differs |= find.states ^ (find.states >> 1);
+    }
+    let count = states.end - states.start;
+    let mut out: Vec<StateVisibility> = Vec::new();
+    let mut first = 0;
+    for last in 0..count {
+        let equal = last + 1 < count
+            && differs >> last & 1 == 0
+            && missing[last as usize] == missing[last as usize + 1];
+        if equal {
+            continue;
+        }
+        let mut members = Vec::new();
+        let mut weights: Vec<f32> = Vec::new();
+        for of_one in by_primitive(found) {
+            let here = of_one.iter().filter(|f| f.states >> first & 1 == 1);
+            let (mut any, mut weight) = (false, 0u64);
+            for find in here {
+                any = true;
+                weight = weight.saturating_add(find.weight);
+            }
+            if any {
+                members.push(of_one[0].primitive);
+                weights.push((weight as f64 / WEIGHT_UNIT) as f32);
+            }
+        }
+        let visibility = SegmentVisibility {
+            set: PrimitiveSet::from_sorted(members),
+            weights,
+            missing: missing[first as usize],
+            statistics,
+        };
+        let run = states.start + first..states.start + last + 1;
+        match out.last_mut() {
+            Some(before) if before.visibility == visibility => before.states.end = run.end,
+            _ => out.push(StateVisibility { states: run, visibility }),
+        }
+        first = last + 1;
+    }
+    out
+}
+
+impl SegmentVisibility {
+    /// True when both have the same result, whatever it took.
+    pub(crate) fn same_result(&self, other: &Self) -> bool {
+        (&self.set, &self.weights) == (&other.set, &other.weights) && self.missing == other.missing
     }
 }
 
@@ -270,6 +488,8 @@ impl TileCounters {
             cuts: self.cuts + other.cuts,
             pixel_tests: self.pixel_tests + other.pixel_tests,
             intervals: self.intervals + other.intervals,
+            volumes: self.volumes + other.volumes,
+            skipped: self.skipped + other.skipped,
         }
     }
 }

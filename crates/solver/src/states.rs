@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use sightline_geometry::{InstancedGeometry, Sampling, StateSets, ViewSegment};
 
-use crate::{SegmentVisibility, SolveOptions, segment::solve_segment_with};
+use crate::{SegmentVisibility, SolveOptions, segment::Solve};
 
 /// The time of a state as the camera moves: t runs from `t0` at the start of the segment to `t1` at its
 /// end, linearly. Both in [0, 1]; where they are equal the clock stands still.
@@ -52,12 +52,27 @@ pub fn solve_states(
     segment: &ViewSegment,
     sampling: Sampling,
     states: Range<u32>,
-    _path: TimePath,
+    path: TimePath,
     known: Known,
     options: &SolveOptions,
 ) -> Vec<StateVisibility> {
-    let known = known.map(StateSets::union);
-    let options = SolveOptions { known: known.as_ref(), ..*options };
-    let visibility = solve_segment_with(geometry, segment, sampling, &options);
-    vec![StateVisibility { states, visibility }]
+    let mut out: Vec<StateVisibility> = Vec::new();
+    let mut first = states.start;
+    while first < states.end {
+        let end = states.end.min(first + Solve::MOST);
+        let solve = Solve { geometry, segment, sampling, states: first..end, path, known };
+        let runs = solve.run(options);
+        if runs.is_empty() {
+            let visibility = SegmentVisibility::default();
+            return vec![StateVisibility { states, visibility }];
+        }
+        out.extend(runs);
+        first = end;
+    }
+    out.dedup_by(|b, a| {
+        let same = a.visibility.same_result(&b.visibility);
+        a.states.end = if same { b.states.end } else { a.states.end };
+        same
+    });
+    out
 }

@@ -24,6 +24,8 @@
 //! Invariant: skipping never changes the result. Boxes and bins are compared with slack for the
 //! rounding of either side, so what is skipped is behind by more than the error bound.
 
+mod moving;
+
 use std::cmp::Ordering;
 
 use glam::{DMat3, DVec3};
@@ -34,7 +36,8 @@ use sightline_geometry::{
 use crate::{
     bounds::ErrorBounds,
     cut::Cut,
-    envelope::{BINS, Column, Envelopes, Line, bin_of, largest, least},
+    envelope::{BINS, Column, Envelopes, Interval, Line, bin_of, largest, least},
+    states::TimePath,
 };
 
 /// Most rows of a tile. Small tiles have tight beams, large ones share a walk; these are the
@@ -140,6 +143,31 @@ pub struct TileCounters {
     pub pixel_tests: u64,
     /// Intervals in the finished lists.
     pub intervals: u64,
+    /// Temporal bounding volumes compared with what rests.
+    pub volumes: u64,
+    /// Moving objects and particles in states in which they were not looked at, as a volume that holds
+    /// them was hidden: sums over tiles.
+    pub skipped: u64,
+}
+
+/// What of a scene's motion a tile is solved for.
+#[derive(Clone, Copy)]
+pub struct Motion<'a> {
+    /// States, ascending.
+    pub states: &'a [u32],
+    /// How camera and time are coupled.
+    pub path: TimePath,
+    /// Whether what is hidden over a window of states is skipped for as long.
+    pub volumes: bool,
+}
+
+/// For which states something was found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum When {
+    /// In all states that have nothing of their own.
+    Always,
+    /// In one state, which has what it sees of its own.
+    In(u32),
 }
 
 /// What a tile is a part of.
@@ -194,6 +222,7 @@ pub struct TileSolver {
     tile_far: Far,
     stack: Vec<Entry>,
     spaces: Vec<Space>,
+    moving: moving::MovingSolver,
     /// See-through finds: (primitive, pixel in tile, length in t).
     seen_through: Vec<(u32, u32, f64)>,
     pub counters: TileCounters,
@@ -203,14 +232,16 @@ pub struct TileSolver {
 
 impl TileSolver {
     /// Solves the tile of rows `w` and columns `c` (coordinates, ascending) and calls
-    /// `found(primitive, pixel, length)` for everything visible on more than the derived bound:
-    /// `pixel` = row * [`TILE_COLUMNS`] + column, `length` in units of t.
+    /// `found(when, primitive, pixel, length)` for everything visible on more than the derived bound:
+    /// `pixel` = row * [`TILE_COLUMNS`] + column, `length` in units of t. First what rests is looked at,
+    /// alone; then, for each state in which something else is seen, everything.
     pub fn solve(
         &mut self,
         context: &TileContext,
         w: &[f64],
         c: &[Column],
-        found: impl FnMut(u32, usize, f64),
+        motion: Option<Motion>,
+        found: impl FnMut(When, u32, usize, f64),
     ) {
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2")
@@ -220,9 +251,9 @@ impl TileSolver {
         {
             // Sound: the processor has what the function was compiled for.
             #[allow(unsafe_code)]
-            return unsafe { self.solve_with_avx2(context, w, c, found) };
+            return unsafe { self.solve_with_avx2(context, w, c, motion, found) };
         }
-        self.solve_anywhere(context, w, c, found);
+        self.solve_anywhere(context, w, c, motion, found);
     }
 
     #[cfg(target_arch = "x86_64")]
@@ -232,9 +263,10 @@ impl TileSolver {
         context: &TileContext,
         w: &[f64],
         c: &[Column],
-        found: impl FnMut(u32, usize, f64),
+        motion: Option<Motion>,
+        found: impl FnMut(When, u32, usize, f64),
     ) {
-        self.solve_anywhere(context, w, c, found);
+        self.solve_anywhere(context, w, c, motion, found);
     }
 
     #[inline(always)]
@@ -243,7 +275,8 @@ impl TileSolver {
         context: &TileContext,
         w: &[f64],
         c: &[Column],
-        mut found: impl FnMut(u32, usize, f64),
+        motion: Option<Motion>,
+        mut found: impl FnMut(When, u32, usize, f64),
     ) {
         assert!(w.len() <= TILE_ROWS && c.len() == TILE_COLUMNS);
         let pixels = w.len() * TILE_COLUMNS;
@@ -264,22 +297,36 @@ impl TileSolver {
         if !context.geometry.see_through.instances.is_empty() {
             self.walk(context, &context.geometry.see_through, Pass::SeeThrough);
         }
+        self.report(pixels, When::Always, &mut found);
+        if let Some(motion) = motion {
+            self.solve_motion(context, &motion, pixels, &mut found);
+        }
+    }
+
+    /// Calls `found` with the intervals of a pixel of the last state that was solved.
+    pub fn intervals(&self, pixel: usize, found: impl FnMut(Interval)) {
+        let time_error = self.columns[pixel % TILE_COLUMNS].time_error;
+        self.envelopes.intervals(pixel, time_error, found);
+    }
+
+    /// Calls `found` with what the lists hold.
+    #[inline(always)]
+    fn report(&mut self, pixels: usize, when: When, found: &mut impl FnMut(When, u32, usize, f64)) {
         #[cfg(debug_assertions)]
         self.envelopes.assert_well_formed();
-
         for pixel in 0..pixels {
-            let shortest = context.bounds.shortest_interval(self.columns[pixel % TILE_COLUMNS].c);
+            let time_error = self.columns[pixel % TILE_COLUMNS].time_error;
             let mut intervals = 0;
-            self.envelopes.intervals(pixel, |primitive, length| {
+            self.envelopes.intervals(pixel, time_error, |interval| {
                 intervals += 1;
-                if length > shortest {
-                    found(primitive, pixel, length);
+                if interval.counts() {
+                    found(when, interval.primitive, pixel, interval.end - interval.start);
                 }
             });
             self.counters.intervals += intervals;
         }
         for &(primitive, pixel, length) in &self.seen_through {
-            found(primitive, pixel as usize, length);
+            found(when, primitive, pixel as usize, length);
         }
     }
 
@@ -478,45 +525,59 @@ impl TileSolver {
         let (matrix, offset) = (s.face_from_local, s.offset);
         let instance = &context.geometry.instances[s.instance.index()];
         let mesh = &context.geometry.meshes[instance.mesh.index()];
+        for start in items.clone().step_by(LANES) {
+            let lanes = LANES.min(items.end - start);
+            let first = instance.first_primitive.0 + start as u32;
+            let corners = FaceTriangles::new(mesh, &mesh.positions, start, lanes, &matrix, offset);
+            self.still_triangles(context, &corners, lanes, first, pass);
+        }
+    }
+
+    /// Triangles that rest, the first of them with this global number.
+    #[inline(always)]
+    fn still_triangles(
+        &mut self,
+        context: &TileContext,
+        corners: &FaceTriangles,
+        lanes: usize,
+        first_primitive: u32,
+        pass: Pass,
+    ) {
         let (c_lo, c_hi) = (self.columns[0].c, self.columns[TILE_COLUMNS - 1].c);
         let slack = |c: f64| 2.0 * context.bounds.depth * (1.0 + c.abs());
         let (slack_lo, slack_hi) = (slack(c_lo), slack(c_hi));
-        for start in items.clone().step_by(LANES) {
-            let lanes = LANES.min(items.end - start);
-            self.counters.triangles += lanes as u64;
-            let corners = FaceTriangles::new(mesh, start, lanes, &matrix, offset);
-            let extents = corners.extents(c_lo, c_hi);
-            for lane in 0..lanes {
-                let rows = rows_met(&self.rows, extents.rows(lane));
-                if rows.is_empty() {
+        self.counters.triangles += lanes as u64;
+        let extents = corners.extents(c_lo, c_hi);
+        for lane in 0..lanes {
+            let rows = rows_met(&self.rows, extents.rows(lane));
+            if rows.is_empty() {
+                continue;
+            }
+            let (first, last) = (extents.first[lane] - slack_hi, extents.last[lane] + slack_lo);
+            if last < 0.0 || first > context.frame.length || first > last {
+                continue;
+            }
+            let inside = self.wedge.nearest(extents.x(lane), extents.y(lane));
+            let near = largest(extents.near[lane], inside) - 2.0 * context.bounds.depth;
+            if self.entry_if_not_hidden(context, near, first, last, 0, 0).is_none() {
+                continue;
+            }
+            let triangle = corners.triangle(lane);
+            let stretches = self.stretches(&triangle);
+            let primitive = first_primitive + lane as u32;
+            for row in rows {
+                let hidden = stretches.iter().enumerate().all(|(k, bins)| {
+                    let far = self.envelopes.far(row * TILE_COLUMNS + k);
+                    far[bins.clone()].iter().all(|&far| near > far)
+                });
+                if hidden {
                     continue;
                 }
-                let (first, last) = (extents.first[lane] - slack_hi, extents.last[lane] + slack_lo);
-                if last < 0.0 || first > context.frame.length || first > last {
-                    continue;
-                }
-                let inside = self.wedge.nearest(extents.x(lane), extents.y(lane));
-                let near = largest(extents.near[lane], inside) - 2.0 * context.bounds.depth;
-                if self.entry_if_not_hidden(context, near, first, last, 0, 0).is_none() {
-                    continue;
-                }
-                let triangle = corners.triangle(lane);
-                let stretches = self.stretches(&triangle);
-                let primitive = instance.first_primitive.0 + (start + lane) as u32;
-                for row in rows {
-                    let hidden = stretches.iter().enumerate().all(|(k, bins)| {
-                        let far = self.envelopes.far(row * TILE_COLUMNS + k);
-                        far[bins.clone()].iter().all(|&far| near > far)
-                    });
-                    if hidden {
-                        continue;
-                    }
-                    let on_axis = context.bounds.depth;
-                    let cut = Cut::of_triangle(&triangle, self.rows[row], on_axis, primitive);
-                    if let Some(cut) = cut {
-                        self.counters.cuts += 1;
-                        self.row_cut(context, row, &cut, pass);
-                    }
+                let on_axis = context.bounds.depth;
+                let cut = Cut::of_triangle(&triangle, self.rows[row], on_axis, primitive);
+                if let Some(cut) = cut {
+                    self.counters.cuts += 1;
+                    self.row_cut(context, row, &cut, pass);
                 }
             }
         }
@@ -566,10 +627,11 @@ impl TileSolver {
                     if self.envelopes.insert(pixel, line, a, b) {
                         self.row_far[row].stale = true;
                         self.tile_far.stale = true;
+                        self.moving.changed = true;
                     }
                 }
                 Pass::SeeThrough => {
-                    let seen = self.envelopes.unhidden_length(pixel, &line, a, b);
+                    let seen = self.envelopes.unhidden_length(pixel, &line, None, (a, b));
                     if seen > context.bounds.shortest_interval(column.c) {
                         self.seen_through.push((cut.primitive, pixel as u32, seen));
                     }
@@ -619,11 +681,19 @@ impl Extents {
 
 impl FaceTriangles {
     #[inline(always)]
-    fn new(mesh: &Mesh, start: usize, lanes: usize, matrix: &DMat3, offset: DVec3) -> Self {
+    fn new(
+        mesh: &Mesh,
+        positions: &[[f32; 3]],
+        start: usize,
+        lanes: usize,
+        matrix: &DMat3,
+        offset: DVec3,
+    ) -> Self {
         let mut local = [[[0.0f64; LANES]; 3]; 3];
         for lane in 0..LANES {
-            let stored = mesh.stored_corners(start + lane.min(lanes - 1));
-            for (corner, stored) in local.iter_mut().zip(stored) {
+            let vertices = mesh.triangles[start + lane.min(lanes - 1)];
+            for (corner, vertex) in local.iter_mut().zip(vertices) {
+                let stored = positions[vertex as usize];
                 for (axis, value) in corner.iter_mut().zip(stored) {
                     axis[lane] = f64::from(value);
                 }
@@ -638,6 +708,19 @@ impl FaceTriangles {
                         + mz[axis] * local[2][lane]
                         + offset[axis];
                 }
+            }
+        }
+        Self { corners }
+    }
+
+    /// Those between these and `other`, at `t` in [0, 1].
+    #[inline(always)]
+    fn between(&self, other: &Self, t: f64) -> Self {
+        let mut corners = self.corners;
+        for (corner, to) in corners.as_flattened_mut().iter_mut().zip(other.corners.as_flattened())
+        {
+            for lane in 0..LANES {
+                corner[lane] = (1.0 - t) * corner[lane] + t * to[lane];
             }
         }
         Self { corners }

@@ -60,6 +60,7 @@ fn describe_scene(path: &Path, command: &Info) -> Result<()> {
         .row("digest", &scene.digest.combined[..16])
         .row("bounds", box_text(scene.geometry.bounds))
         .row("triangles", thousands(report.instanced_triangles))
+        .row("particles", thousands(report.particles))
         .row("unique triangles", thousands(report.unique_triangles))
         .row("unique vertices", thousands(report.unique_vertices))
         .row("objects", thousands(report.objects))

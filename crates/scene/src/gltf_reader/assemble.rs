@@ -11,7 +11,9 @@ use super::{
     primitives::{PlacedBody, Unique},
 };
 use crate::{
-    Cause, IngestReport, InstanceSource, MeshSource, Object, OpenOptions, Scene, SceneError, morton,
+    Cause, IngestReport, InstanceSource, MeshSource, Object, OpenOptions, Scene, SceneDigest,
+    SceneError, morton,
+    particles::{self, Tables, merge_key_times},
 };
 
 /// The see-through patterns of the options.
@@ -48,6 +50,7 @@ pub fn scene(
     buffers: &Buffers,
     placed: Placed,
     unique: Unique,
+    tables: Tables,
     see_through: &GlobSet,
 ) -> Result<Scene, SceneError> {
     check_count(&unique)?;
@@ -109,18 +112,33 @@ pub fn scene(
     }
     let (bodies, meshes): (Vec<_>, Vec<MeshSource>) =
         unique.bodies.into_iter().map(|b| (b.mesh, b.source)).unzip();
-    let geometry = InstancedGeometry::new(bodies, instances);
+    let digest = SceneDigest::of_files([buffers.files(), &tables.files()].concat());
+    let key_times = merge_key_times(&tables.key_times());
+    let placed = tables.place(&key_times, objects.len() as u32, next, see_through)?;
+    objects.extend(placed.objects);
+    let states = particles::states(&key_times);
+    let geometry = InstancedGeometry::with_motion(bodies, instances, placed.systems, states);
     count(&mut report, &geometry, objects.len());
-    Ok(Scene { geometry, objects, meshes, instances: sources, report, digest: buffers.digest() })
+    Ok(Scene {
+        geometry,
+        objects,
+        meshes,
+        instances: sources,
+        particles: placed.sources,
+        key_times,
+        report,
+        digest,
+    })
 }
 
 fn count(report: &mut IngestReport, geometry: &InstancedGeometry, objects: usize) {
     report.unique_triangles = geometry.unique_triangle_count() as u64;
-    report.instanced_triangles = u64::from(geometry.primitive_count());
+    report.instanced_triangles = u64::from(geometry.triangle_count());
     report.unique_vertices = geometry.meshes.iter().map(|m| m.positions.len() as u64).sum();
     report.objects = objects as u64;
     report.meshes = geometry.meshes.len() as u64;
     report.instances = geometry.instances.len() as u64;
+    report.count_particles(&geometry.particles);
 }
 
 /// Refuses scenes with more triangles than primitive numbers.

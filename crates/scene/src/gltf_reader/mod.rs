@@ -32,7 +32,8 @@ pub(crate) mod uri;
 
 use std::path::Path;
 
-use crate::{Cause, OpenOptions, Scene, SceneDigest, SceneError};
+use crate::{Cause, OpenOptions, Scene, SceneError, particles::Tables};
+pub use assemble::see_through_patterns;
 
 /// Largest coordinate of a used vertex and of anything in the world, metres (a tenth of a light
 /// year). Keeps areas and volumes of boxes finite in `f32` hierarchies.
@@ -45,7 +46,7 @@ pub fn read(path: &Path, options: &OpenOptions) -> Result<Scene, SceneError> {
 
 /// Reads and numbers a scene whose main file is in memory.
 pub fn read_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Scene, SceneError> {
-    let see_through = assemble::see_through_patterns(options)?;
+    let see_through = see_through_patterns(options)?;
     let parts = container::split(main)?;
     let document = document::Document::parse(parts.json)?;
     document.check_extensions()?;
@@ -53,15 +54,16 @@ pub fn read_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Sce
     let accessors = accessors::Accessors::new(&document, &buffers);
     let placed = nodes::placements(&document, &accessors, options)?;
     let unique = primitives::collect(&document, &accessors, &placed, options)?;
-    assemble::scene(&document, &buffers, placed, unique, &see_through)
+    let tables = Tables::read(options)?;
+    assemble::scene(&document, &buffers, placed, unique, tables, &see_through)
 }
 
-/// Hashes the files of a scene.
-pub fn digest(path: &Path) -> Result<SceneDigest, SceneError> {
+/// Names, sizes and hashes of the files of a scene.
+pub fn files(path: &Path) -> Result<Vec<(String, u64, blake3::Hash)>, SceneError> {
     let main = read_main_file(path)?;
     let parts = container::split(&main)?;
     let document = document::Document::parse(parts.json)?;
-    Ok(buffers::Buffers::load(path, &main, parts.binary, &document)?.digest())
+    Ok(buffers::Buffers::load(path, &main, parts.binary, &document)?.files().to_vec())
 }
 
 fn read_main_file(path: &Path) -> Result<Vec<u8>, SceneError> {
