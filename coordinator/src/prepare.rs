@@ -59,15 +59,18 @@ fn describe(skipped: &SkippedCells) -> String {
 /// When the configuration, the scene or the region is refused.
 pub fn prepare(path: &Path, config: BakeConfig) -> Result<Prepared, PrepareError> {
     config.validate()?;
-    let scene = Scene::open(path, &open_options(&config))?;
+    let scene = Scene::open(path, &open_options(path, &config))?;
     prepare_scene(Arc::new(scene), path, config)
 }
 
-/// How a scene has to be opened for a bake with this configuration: workers do the same.
+/// How the scene at `path` has to be opened for a bake with this configuration: workers do the same.
+/// Tables of particles lie relative to it.
 #[must_use]
-pub fn open_options(config: &BakeConfig) -> OpenOptions {
+pub fn open_options(path: &Path, config: &BakeConfig) -> OpenOptions {
     let mut options = OpenOptions::default();
     options.see_through.clone_from(&config.scene.see_through);
+    let folder = path.parent().unwrap_or(Path::new(""));
+    options.particles = config.scene.particles.iter().map(|table| folder.join(table)).collect();
     options
 }
 
@@ -93,7 +96,7 @@ pub fn prepare_scene(
         numbering: numbering(&scene),
         source: source(&reference, &scene),
     };
-    let plan = plan(reference, config, key_times(&scene), cells, skipped);
+    let plan = plan(reference, config, scene.key_times.clone(), cells, skipped);
     tracing::info!(
         cells = plan.cells.len(),
         segments = plan.segments.len(),
@@ -101,17 +104,6 @@ pub fn prepare_scene(
         "the bake is planned"
     );
     Ok(Prepared { scene, plan, publisher })
-}
-
-/// Times of the scene's key frames, seconds.
-// To be replaced by `Scene::key_times` as soon as scenes tell when their key frames are: until then
-// every state takes a second.
-fn key_times(scene: &Scene) -> Vec<f64> {
-    let geometry = &scene.geometry;
-    if geometry.states == 1 && !geometry.has_motion() {
-        return vec![0.0];
-    }
-    (0..=geometry.states).map(f64::from).collect()
 }
 
 fn region_spec(config: &BakeConfig) -> RegionSpec {

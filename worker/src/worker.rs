@@ -191,7 +191,11 @@ impl Life {
 
     async fn read_scene(&self, path: &Path, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
         let mut options = OpenOptions::default();
-        options.see_through.clone_from(&plan.config.scene.see_through);
+        // As the coordinator did.
+        let asked = &plan.config.scene;
+        options.see_through.clone_from(&asked.see_through);
+        let folder = path.parent().unwrap_or(Path::new(""));
+        options.particles = asked.particles.iter().map(|table| folder.join(table)).collect();
         let path = path.to_owned();
         let read = self.pool.run(move || Scene::open(&path, &options)).await;
         let scene = read.map_err(|panic| WorkerError::Defect(panic.to_string()))??;

@@ -93,9 +93,8 @@ fn main() {
         for segment in &segments {
             let sampling = sampling.jittered(segment.id.0 + run * segments.len() as u32);
             let path = arguments.stopped.map_or_else(|| path(run), TimePath::stopped);
-            let found = solve_states(
-                geometry, segment, sampling, 0..states, path, all.as_ref(), &options,
-            );
+            let found =
+                solve_states(geometry, segment, sampling, 0..states, path, all.as_ref(), &options);
             total = total.plus(found[0].visibility.statistics);
             let found =
                 StateSets::from_runs(found.into_iter().map(|f| (f.states, f.visibility.set)));

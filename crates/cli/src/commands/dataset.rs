@@ -26,17 +26,22 @@ pub async fn open(location: &str) -> Result<Dataset> {
 pub async fn open_with_scene(input: &DatasetInput) -> Result<(Dataset, Scene, PathBuf)> {
     let dataset = open(&input.dataset).await?;
     let path = find_scene(&dataset, input).await?;
-    let scene = Scene::open(&path, &open_options(dataset.manifest()))?;
+    let scene = Scene::open(&path, &open_options(dataset.manifest(), &path))?;
     expect_digest(dataset.manifest(), &scene.digest, &path)?;
     Ok((dataset, scene, path))
 }
 
-/// How the bake read the scene: see-through patterns decide what hides what.
-fn open_options(manifest: &Manifest) -> OpenOptions {
-    let patterns = manifest.config["scene"]["see_through"].as_array();
+/// How the bake read the scene: see-through patterns decide what hides what, and particles are in tables
+/// relative to it.
+fn open_options(manifest: &Manifest, path: &Path) -> OpenOptions {
+    let texts = |key: &str| {
+        let texts = manifest.config["scene"][key].as_array();
+        texts.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned)
+    };
     let mut options = OpenOptions::default();
-    options.see_through =
-        patterns.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect();
+    options.see_through = texts("see_through").collect();
+    let folder = path.parent().unwrap_or(Path::new(""));
+    options.particles = texts("particles").map(|table| folder.join(table)).collect();
     options
 }
 
@@ -55,8 +60,9 @@ async fn find_scene(dataset: &Dataset, input: &DatasetInput) -> Result<PathBuf> 
     candidates.push(folder.join("..").join(&source.uri));
     candidates.push(folder.join(&source.uri));
     for path in &candidates {
-        if path.is_file() && sightline_scene::digest(path).is_ok_and(|d| d.combined == source.hash)
-        {
+        let tables = open_options(dataset.manifest(), path).particles;
+        let digest = || sightline_scene::digest_with(path, &tables);
+        if path.is_file() && digest().is_ok_and(|d| d.combined == source.hash) {
             return Ok(path.clone());
         }
     }
