@@ -69,7 +69,7 @@ pub fn solve_segments(
 
 /// How camera and time are coupled along a segment of the plan.
 pub(crate) const fn planned_path(segment: SegmentId) -> TimePath {
-    if segment.0 % 2 == 0 { TimePath::FORWARD } else { TimePath::REVERSED }
+    if segment.0.is_multiple_of(2) { TimePath::FORWARD } else { TimePath::REVERSED }
 }
 
 /// Passes of finer rays within a solve: the last has 16 times the rows of the first.

@@ -83,6 +83,14 @@ pub struct SceneSource {
     pub files: Vec<SceneFile>,
 }
 
+impl SceneSource {
+    /// Number of primitives: triangles and particles.
+    #[must_use]
+    pub const fn primitives(&self) -> u64 {
+        self.triangles.saturating_add(self.particles)
+    }
+}
+
 /// A file of the scene.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SceneFile {

@@ -136,6 +136,8 @@ pub struct Summary {
     pub cells: u64,
     /// Primitives of the scene.
     pub primitives: u64,
+    /// Of these, particles.
+    pub particles: u64,
     /// Mean number of visible primitives a cell.
     pub visible_mean: f64,
     /// Largest number of visible primitives of a cell.
@@ -161,7 +163,9 @@ pub struct Summary {
 impl Summary {
     /// Reads all cells; of each, the row of all states.
     pub async fn of(dataset: &Dataset) -> Result<Self> {
-        let mut out = Self { primitives: dataset.manifest().scene.triangles, ..Self::default() };
+        let scene = &dataset.manifest().scene;
+        let (primitives, particles) = (scene.primitives(), scene.particles);
+        let mut out = Self { primitives, particles, ..Self::default() };
         let (mut visible, mut error) = (0u64, 0.0f64);
         let mut rows = std::pin::pin!(dataset.cell_rows());
         while let Some(row) = rows.try_next().await? {
@@ -214,7 +218,11 @@ impl Summary {
     /// Adds the figures to a table.
     pub fn add_to(&self, table: &mut crate::report::Table) {
         use crate::report::{count, percent, thousands};
-        table.row("cells", thousands(self.cells)).row("triangles", thousands(self.primitives));
+        let triangles = self.primitives - self.particles;
+        table.row("cells", thousands(self.cells)).row("triangles", thousands(triangles));
+        if self.particles > 0 {
+            table.row("particles", thousands(self.particles));
+        }
         if self.cells == 0 {
             return;
         }
@@ -227,7 +235,8 @@ impl Summary {
             ),
         );
         if let Some(factor) = self.reduction() {
-            table.row("reduction", format!("{factor:.1} times fewer triangles"));
+            let kind = if self.particles > 0 { "primitives" } else { "triangles" };
+            table.row("reduction", format!("{factor:.1} times fewer {kind}"));
         }
         if self.heldout_rays > 0 {
             table.row(

@@ -311,6 +311,7 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
         }));
         return Ok(());
     }
+    let kind = if dataset.manifest().scene.particles > 0 { "primitive" } else { "triangle" };
     let mut table = Table::default();
     table
         .row("cell", format!("{cell}, tile {}, {}", row.tile[0], row.tile[1]))
@@ -319,8 +320,8 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
             "visible",
             format!(
                 "{} of {} in {}",
-                count(row.set.len(), "triangle"),
-                thousands(dataset.manifest().scene.triangles),
+                count(row.set.len(), kind),
+                thousands(dataset.manifest().scene.primitives()),
                 count(row.set.runs().len() as u64, "run")
             ),
         )
@@ -358,7 +359,7 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
                 "{:>8.4} %  {} of {}",
                 100.0 * pair.weight,
                 thousands(u64::from(pair.visible_primitives)),
-                count(u64::from(pair.total_primitives), "triangle")
+                count(u64::from(pair.total_primitives), kind)
             ),
         );
     }
