@@ -401,19 +401,22 @@ async fn a_state_has_the_row_of_its_run_and_no_state_that_of_all() {
     assert!(dataset.runs(CellId(999)).is_empty());
 }
 
+/// Damages the rows of a cell and of its objects.
+type Change<'a> = &'a dyn Fn(&mut Vec<CellRow>, &mut Vec<ObjectRow>);
+
 #[tokio::test]
 async fn rows_of_states_that_contradict_each_other_are_refused() {
     let sample = Sample::golden();
     let store = BakeStore::in_memory();
     let (rows, pairs) = (sample.rows(3), sample.cells[3].1.clone());
-    let refused = async |change: &dyn Fn(&mut Vec<CellRow>, &mut Vec<ObjectRow>)| {
+    let refused = async |change: Change<'_>| {
         let (mut rows, mut pairs) = (rows.clone(), pairs.clone());
         change(&mut rows, &mut pairs);
         let (objects, timeline) = (sample.objects.clone(), sample.timeline.clone());
         let mut writer = DatasetWriter::new(&store, objects, timeline).unwrap();
         writer.push_cell(&rows, &pairs).await.unwrap_err().to_string()
     };
-    let cases: [(&dyn Fn(&mut Vec<CellRow>, &mut Vec<ObjectRow>), &str); 9] = [
+    let cases: [(Change<'_>, &str); 9] = [
         (&|rows, _| rows.clear(), "has no row"),
         (&|rows, _| drop(rows.remove(0)), "is not of all 5 states"),
         (&|rows, _| rows.swap(1, 2), "ascending order"),

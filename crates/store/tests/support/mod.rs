@@ -233,7 +233,8 @@ fn cell(id: u32, objects: &[SceneObject], random: &mut Sequence) -> (CellRow, Ve
 
 /// What a run of states sees of a cell's set: two members of three, others in each run.
 fn part(union: &CellRow, states: &std::ops::Range<u32>, run: u32) -> CellRow {
-    let seen = union.set.iter().zip(&union.weights).filter(|(p, _)| (p.0 / 7 + run) % 3 != 0);
+    let seen =
+        union.set.iter().zip(&union.weights).filter(|(p, _)| !(p.0 / 7 + run).is_multiple_of(3));
     let (members, weights): (Vec<u32>, Vec<Weight>) = seen.map(|(p, w)| (p.0, *w)).unzip();
     CellRow {
         first_state: states.start,
