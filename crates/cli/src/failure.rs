@@ -297,9 +297,9 @@ impl From<WorkerError> for Failure {
             WorkerError::BadUrl { .. } | WorkerError::Threads { .. } => {
                 Self::new(Kind::Usage, text)
             }
-            WorkerError::OtherScene { .. } | WorkerError::Plan { .. } => {
-                Self::new(Kind::Input, text)
-            }
+            WorkerError::OtherScene { .. }
+            | WorkerError::OtherStates { .. }
+            | WorkerError::Plan { .. } => Self::new(Kind::Input, text),
             WorkerError::Unreachable { .. } => Self::new(Kind::Network, text),
             WorkerError::Refused(_) => Self::new(Kind::Network, text)
                 .with_help("run the same version of Sightline as the coordinator"),
