@@ -67,11 +67,14 @@ pub fn prepare(path: &Path, config: BakeConfig) -> Result<Prepared, PrepareError
 /// Tables of particles lie relative to it.
 #[must_use]
 pub fn open_options(path: &Path, config: &BakeConfig) -> OpenOptions {
-    let mut options = OpenOptions::default();
-    options.see_through.clone_from(&config.scene.see_through);
-    let folder = path.parent().unwrap_or(Path::new(""));
-    options.particles = config.scene.particles.iter().map(|table| folder.join(table)).collect();
-    options
+    let scene = &config.scene;
+    OpenOptions::of_bake(
+        path,
+        &scene.see_through,
+        &scene.particles,
+        scene.animation.as_deref(),
+        scene.motion_error,
+    )
 }
 
 /// As [`prepare`], with a scene that was opened with [`open_options`].

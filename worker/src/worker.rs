@@ -190,12 +190,15 @@ impl Life {
     }
 
     async fn read_scene(&self, path: &Path, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
-        let mut options = OpenOptions::default();
         // As the coordinator did.
         let asked = &plan.config.scene;
-        options.see_through.clone_from(&asked.see_through);
-        let folder = path.parent().unwrap_or(Path::new(""));
-        options.particles = asked.particles.iter().map(|table| folder.join(table)).collect();
+        let options = OpenOptions::of_bake(
+            path,
+            &asked.see_through,
+            &asked.particles,
+            asked.animation.as_deref(),
+            asked.motion_error,
+        );
         let path = path.to_owned();
         let read = self.pool.run(move || Scene::open(&path, &options)).await;
         let scene = read.map_err(|panic| WorkerError::Defect(panic.to_string()))??;

@@ -88,6 +88,45 @@ pub enum AnimationChoice {
     Name(String),
 }
 
+impl AnimationChoice {
+    /// The choice that a configuration writes as text: `all`, `none`, an index or a name; the first
+    /// animation where there is none.
+    #[must_use]
+    pub fn of_text(text: Option<&str>) -> Self {
+        match text {
+            None => Self::First,
+            Some("all") => Self::All,
+            Some("none") => Self::None,
+            Some(text) => match text.parse() {
+                Ok(index) => Self::Index(index),
+                Err(_) => Self::Name(text.to_owned()),
+            },
+        }
+    }
+}
+
+impl OpenOptions {
+    /// How the scene at `path` is read for a bake that says this of it: coordinators, workers and who
+    /// reads the dataset do the same. Particle tables lie relative to the scene.
+    #[must_use]
+    pub fn of_bake(
+        path: &Path,
+        see_through: &[String],
+        particles: &[String],
+        animation: Option<&str>,
+        motion_error: f64,
+    ) -> Self {
+        let folder = path.parent().unwrap_or(Path::new(""));
+        Self {
+            see_through: see_through.to_vec(),
+            particles: particles.iter().map(|table| folder.join(table)).collect(),
+            animation: AnimationChoice::of_text(animation),
+            motion_error,
+            ..Self::default()
+        }
+    }
+}
+
 /// What the author named: a node with at least one triangle, or a particle table.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {

@@ -34,15 +34,21 @@ pub async fn open_with_scene(input: &DatasetInput) -> Result<(Dataset, Scene, Pa
 /// How the bake read the scene: see-through patterns decide what hides what, and particles are in tables
 /// relative to it.
 fn open_options(manifest: &Manifest, path: &Path) -> OpenOptions {
-    let texts = |key: &str| {
-        let texts = manifest.config["scene"][key].as_array();
-        texts.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned)
+    let scene = &manifest.config["scene"];
+    let texts = |key: &str| -> Vec<String> {
+        let texts = scene[key].as_array();
+        texts.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect()
     };
-    let mut options = OpenOptions::default();
-    options.see_through = texts("see_through").collect();
-    let folder = path.parent().unwrap_or(Path::new(""));
-    options.particles = texts("particles").map(|table| folder.join(table)).collect();
-    options
+    // Datasets from before there was motion were baked at rest.
+    let motion_error = scene["motion_error"].as_f64();
+    let animation = if motion_error.is_some() { scene["animation"].as_str() } else { Some("none") };
+    OpenOptions::of_bake(
+        path,
+        &texts("see_through"),
+        &texts("particles"),
+        animation,
+        motion_error.unwrap_or_else(|| OpenOptions::default().motion_error),
+    )
 }
 
 async fn find_scene(dataset: &Dataset, input: &DatasetInput) -> Result<PathBuf> {
