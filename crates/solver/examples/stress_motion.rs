@@ -211,8 +211,7 @@ fn main() -> ExitCode {
     };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(arguments.threads).build();
     let wrong = pool.expect("threads can be started").install(|| {
-        let equations =
-            if arguments.family.is_empty() { solve_quadratics(&arguments) } else { 0 };
+        let equations = if arguments.family.is_empty() { solve_quadratics(&arguments) } else { 0 };
         equations
             + compare("Triangles", &chosen(FAMILIES), &arguments)
             + compare("Spheres", &chosen(BALLS), &arguments)

@@ -140,8 +140,8 @@ impl Arc {
                     // What moves fast may be far away at another time: here no depth is beyond this.
                     let top = least(largest(z0, z1) + bulge, self.far);
                     let noise = 2.0 * (n_error + top * d_error) * inverse;
-                    let like = top * d_error <= *n_error || top <= 4.0 * least(z0, z1);
-                    even = noise <= self.error || (largest_d <= 4.0 * least_d && like);
+                    let like = top * d_error <= *n_error || top <= 2.0 * least(z0, z1);
+                    even = noise <= self.error || (largest_d <= 2.0 * least_d && like);
                     (bulge, bulge, self.error + least(noise, whole))
                 }
             }
@@ -150,9 +150,13 @@ impl Arc {
                 let root = |v: f64| largest(v, 0.0).sqrt();
                 let (h0, h1) = (root(g[0]), root(g[2]));
                 let k = largest((h1 - h0) * (h1 - h0) - (g[0] - 2.0 * g[1] + g[2]), 0.0);
-                let bulge = least(0.5 * k.sqrt(), k / (8.0 * least(h0, h1))) * inverse;
+                // A cone: k and h are 0 where the camera is at its tip.
+                let bulge =
+                    if k > 0.0 { least(0.5 * k.sqrt(), k / (8.0 * least(h0, h1))) } else { 0.0 };
+                let bulge = bulge * inverse;
                 // A root of g is off by noise / (2 sqrt(g)), or the root of noise where g is no more.
-                let (low, high) = (least(least(g[0], g[1]), g[2]), largest(largest(g[0], g[1]), g[2]));
+                let (low, high) =
+                    (least(least(g[0], g[1]), g[2]), largest(largest(g[0], g[1]), g[2]));
                 let off = if low > *noise { noise / low.sqrt() } else { noise.sqrt() };
                 let error = self.error + off * inverse;
                 even = off * inverse <= self.error || high <= 16.0 * largest(low, *noise);
@@ -228,20 +232,15 @@ impl Curve<'_> {
 /// is never for two triangles of one plane. Their difference does not bend: of quotients it has the sign
 /// of `N D' - N' D`, of degree 5, times that of `D D'`; that of two spheres is at most the difference of
 /// their feet and of the roots of their g.
-fn side_by_side(
-    a: Curve,
-    b: Curve,
-    (s, e): (f64, f64),
-    error: f64,
-    noise: f64,
-) -> Option<i32> {
+fn side_by_side(a: Curve, b: Curve, (s, e): (f64, f64), error: f64, noise: f64) -> Option<i32> {
     if let (Some(a), Some(b)) = (a.arc, b.arc)
         && let (
             Shape::Ball { foot: f, g, inverse, from_inside, .. },
             Shape::Ball { foot: k, g: h, from_inside: other, .. },
         ) = (&a.shape, &b.shape)
     {
-        let feet = largest((linear(*f, s) - linear(*k, s)).abs(), (linear(*f, e) - linear(*k, e)).abs());
+        let feet =
+            largest((linear(*f, s) - linear(*k, s)).abs(), (linear(*f, e) - linear(*k, e)).abs());
         let (g, h) = (quadratic_on(*g, s, e), quadratic_on(*h, s, e));
         let apart = g.iter().zip(&h).fold(0.0, |most, (x, y)| largest(most, (x - y).abs()));
         let low = g.iter().chain(&h).fold(f64::INFINITY, |low, v| least(low, *v));
@@ -324,7 +323,7 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
         let certain = |d: f64| i32::from(d > noise) - i32::from(d < -noise);
         let (at_s, at_e) = (certain(d0), certain(d1));
         let bulge = below + above;
-        let thin = bulge <= noise && p.even && q.even;
+        let thin = bulge <= 0.5 * noise && p.even && q.even;
         left -= 1;
         // Bands as thin as rounding: lines.
         if thin || e - s <= shortest || open + 3 > stack.len() || left <= 0 {

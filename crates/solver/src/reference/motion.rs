@@ -169,9 +169,7 @@ impl Body {
             }
         };
         let form = match &self.form {
-            Form::Triangle(ends) => {
-                Form::Triangle(ends.each_ref().map(|p| p.each_ref().map(turn)))
-            }
+            Form::Triangle(ends) => Form::Triangle(ends.each_ref().map(|p| p.each_ref().map(turn))),
             Form::Sphere(centers, radii) => {
                 Form::Sphere(centers.each_ref().map(turn), radii.clone())
             }
@@ -349,8 +347,9 @@ impl Along {
                 let n = (0..3).fold(vec![RBig::ZERO], |n, k| {
                     add(&n, &multiply(&e[k], &corners[(k + 2) % 3][2]))
                 });
-                let behind =
-                    corners.iter().any(|c| [0, 1].iter().any(|t| sign(&value(&c[2], &RBig::from(*t))) <= 0));
+                let behind = corners
+                    .iter()
+                    .any(|c| [0, 1].iter().any(|t| sign(&value(&c[2], &RBig::from(*t))) <= 0));
                 Self::Triangle { h: gh.map(|p| p.1), e, n, d, behind }
             }
             Form::Sphere([p, q], [r0, r1]) => {

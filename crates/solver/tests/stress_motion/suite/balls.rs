@@ -6,7 +6,7 @@ use super::{
     case::{Pose, coarse_sampling, small_sampling},
     families::{Family, families},
     random::Random,
-    scene::{Ball, MovingCase, MovingScene, Moves},
+    scene::{Ball, Moves, MovingCase, MovingScene},
 };
 
 /// All families of spheres.
@@ -28,9 +28,7 @@ pub const BALLS: &[Family] = families! {
 };
 
 fn ball(random: &mut Random, keys: usize, spread: f64, size: f64) -> Ball {
-    (0..keys)
-        .map(|_| Some((random.in_cube(spread), random.magnitude(0.05 * size..size))))
-        .collect()
+    (0..keys).map(|_| Some((random.in_cube(spread), random.magnitude(0.05 * size..size)))).collect()
 }
 
 /// Adds spheres, puts the camera's start as their origin.

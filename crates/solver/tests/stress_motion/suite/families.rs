@@ -9,7 +9,7 @@ use sightline_solver::TimePath;
 use super::{
     case::{Pose, coarse_sampling, small_sampling},
     random::Random,
-    scene::{MovingCase, MovingScene, Moves},
+    scene::{Moves, MovingCase, MovingScene},
 };
 
 /// A named generator of cases.
@@ -215,8 +215,7 @@ fn lattice(random: &mut Random) -> MovingCase {
     let pose = Pose::aligned(random, length);
     let mut scene = MovingScene::new(1);
     for occluder in [true, true, false] {
-        let mut corner =
-            || DVec3::from_array(std::array::from_fn(|_| random.integer(-4..=4)));
+        let mut corner = || DVec3::from_array(std::array::from_fn(|_| random.integer(-4..=4)));
         let mut one = || -> [DVec3; 3] { std::array::from_fn(|_| corner()) };
         let soup: Vec<Moves> = (0..5).map(|_| vec![one(), one()]).collect();
         scene.add_soup(&soup, &[pose.world_from_face], occluder);

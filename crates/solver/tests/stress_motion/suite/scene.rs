@@ -112,7 +112,12 @@ impl MovingScene {
         self.primitives
     }
 
-    pub fn finish(self, random: &mut Random, segment: ViewSegment, sampling: Sampling) -> MovingCase {
+    pub fn finish(
+        self,
+        random: &mut Random,
+        segment: ViewSegment,
+        sampling: Sampling,
+    ) -> MovingCase {
         let mut next = self.primitives;
         let mut systems = Vec::new();
         for (keys, origin, occluder) in self.systems {

@@ -15,7 +15,7 @@ use super::{
     closed::{Closed, any_pose, large_sampling, sphere},
     families::{Family, families},
     random::Random,
-    scene::{MovingCase, MovingScene, Moves},
+    scene::{Moves, MovingCase, MovingScene},
 };
 
 /// All closed families.
@@ -54,7 +54,13 @@ fn add(
 }
 
 /// Triangles within `size` of places that `at` gives, each with its own motion.
-fn small(random: &mut Random, count: usize, keys: usize, at: impl Fn(&mut Random) -> DVec3, size: f64) -> Vec<Moves> {
+fn small(
+    random: &mut Random,
+    count: usize,
+    keys: usize,
+    at: impl Fn(&mut Random) -> DVec3,
+    size: f64,
+) -> Vec<Moves> {
     (0..count)
         .map(|_| {
             (0..keys)
@@ -189,7 +195,8 @@ fn around_ball(random: &mut Random) -> MovingCase {
     let end = {
         let soup = small(random, 60, 2, |r| r.direction() * away, 0.1 * away);
         // Between two places that are far out, what moves may pass: so all of it is on one side.
-        let soup: Vec<Moves> = soup.into_iter().map(|m| vec![m[0], m[0].map(|p| p * 1.5)]).collect();
+        let soup: Vec<Moves> =
+            soup.into_iter().map(|m| vec![m[0], m[0].map(|p| p * 1.5)]).collect();
         scene.add_soup(&soup, &[s.pose.world_from_face], true).end
     };
     let mut radius = || s.scale * random.within(1.0..1.5);

@@ -35,8 +35,7 @@ pub fn shuffled(case: &MovingCase, random: &mut Random) -> (MovingCase, Vec<u32>
     for system in &geometry.particles {
         let mut mixed: Vec<usize> = (0..system.len()).collect();
         random.shuffle(&mut mixed);
-        let keys =
-            system.keys.iter().map(|key| mixed.iter().map(|&i| key[i]).collect()).collect();
+        let keys = system.keys.iter().map(|key| mixed.iter().map(|&i| key[i]).collect()).collect();
         let first = PrimitiveId(before.len() as u32);
         let (new, order) =
             ParticleSystem::new(system.object, first, system.occluder, system.origin, keys);

@@ -63,9 +63,7 @@ const ALGEBRAIC_BODIES_MAX: usize = 60;
 /// Stretches of t that are uncertain: around each border of a list.
 fn windows(intervals: &[Interval]) -> Vec<(f64, f64, f64)> {
     let mut out: Vec<(f64, f64, f64)> = Vec::new();
-    let ends = intervals
-        .iter()
-        .flat_map(|i| [(i.start, i.start_error), (i.end, i.end_error)]);
+    let ends = intervals.iter().flat_map(|i| [(i.start, i.start_error), (i.end, i.end_error)]);
     for (at, error) in ends {
         // Slightly more than the bound, and than the rounding of the sums.
         let reach = error * (1.0 + 1e-9) + 4.0 * f64::EPSILON;
@@ -104,8 +102,7 @@ pub fn judge(case: &MovingCase, random: &mut Random) -> Tally {
         let along = judge.along(pixel.face, c, w);
         let windows = windows(intervals);
         let at_borders = windows.iter().flat_map(|w| [w.0, w.2]);
-        let times: Vec<f64> =
-            at_borders.chain((0..RANDOM_TIMES).map(|_| random.unit())).collect();
+        let times: Vec<f64> = at_borders.chain((0..RANDOM_TIMES).map(|_| random.unit())).collect();
         for t in times.into_iter().filter(|&t| is_free(&windows, t)) {
             tally.look(&along, t, answer(intervals, t), pixel);
         }
@@ -136,10 +133,8 @@ fn algebraic(
     }
     tally.algebraic += 1;
     let exact = motion::pixel(&bodies, &judge.ray(c, w)).occluders;
-    let exact: Vec<(f64, f64, u32)> = exact
-        .iter()
-        .map(|i| (i.t0.to_f64().value(), i.t1.to_f64().value(), i.primitive))
-        .collect();
+    let exact: Vec<(f64, f64, u32)> =
+        exact.iter().map(|i| (i.t0.to_f64().value(), i.t1.to_f64().value(), i.primitive)).collect();
     let windows = windows(intervals);
     let mut borders: Vec<f64> = windows.iter().flat_map(|w| [w.0, w.2]).collect();
     borders.extend(exact.iter().flat_map(|i| [i.0, i.1]));
