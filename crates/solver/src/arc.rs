@@ -314,11 +314,12 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
             runs.push(s, e, 1);
             continue;
         }
-        if p.even && q.even {
-            if let Some(sign) = side_by_side(a, b, (s, e), base[0] + base[1], noise) {
-                runs.push(s, e, sign);
-                continue;
-            }
+        if p.even
+            && q.even
+            && let Some(sign) = side_by_side(a, b, (s, e), base[0] + base[1], noise)
+        {
+            runs.push(s, e, sign);
+            continue;
         }
         let certain = |d: f64| i32::from(d > noise) - i32::from(d < -noise);
         let (at_s, at_e) = (certain(d0), certain(d1));
