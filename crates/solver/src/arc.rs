@@ -146,7 +146,10 @@ impl Arc {
                 let root = |v: f64| largest(v, 0.0).sqrt();
                 let (h0, h1) = (root(g[0]), root(g[2]));
                 let k = largest((h1 - h0) * (h1 - h0) - (g[0] - 2.0 * g[1] + g[2]), 0.0);
-                let bulge = least(0.5 * k.sqrt(), k / (8.0 * least(h0, h1))) * inverse;
+                // A cone: k and h are 0 where the camera is at its tip.
+                let bulge =
+                    if k > 0.0 { least(0.5 * k.sqrt(), k / (8.0 * least(h0, h1))) } else { 0.0 };
+                let bulge = bulge * inverse;
                 let low = least(least(g[0], g[1]), g[2]);
                 let error = self.error + root_noise(low, *noise) * inverse;
                 if *from_inside { (0.0, bulge, error) } else { (bulge, 0.0, error) }

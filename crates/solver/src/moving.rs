@@ -423,13 +423,16 @@ impl<'a> MovingRow<'a> {
             if from >= to || on(middle) <= bounds.depth {
                 continue;
             }
-            // The end at the camera plane is off by what moves N by its noise.
+            // The end at the camera plane is off by what moves N by its noise, and by that of corners
+            // that are off by D along the normal.
+            let moved = 2.0 * noise + bounds.depth * self.triangle.normal_size;
             let own = |at: f64| {
                 if at == start || at == end {
                     return 0.0;
                 }
-                let slope = (cubic(n, middle) - cubic(n, at)) / (middle - at);
-                least(4.0 * noise / slope.abs(), 1.0)
+                let slope = 3.0 * quadratic([n[1] - n[0], n[2] - n[1], n[3] - n[2]], at);
+                let bend = 3.0 * linear([n[2] - 2.0 * n[1] + n[0], n[3] - 2.0 * n[2] + n[1]], at);
+                least(root_error(slope, bend, moved), 1.0)
             };
             let error = largest(error, largest(own(from), own(to)));
             covered(Covered { start: from, end: to, error });

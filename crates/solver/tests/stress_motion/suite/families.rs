@@ -397,7 +397,7 @@ fn mixed(random: &mut Random) -> MovingCase {
         // At rest in one of the states.
         let mut soup = movers(random, count, 3, spread, 4.0);
         let rests = random.below(2);
-        for moves in soup.iter_mut().filter(|_| true) {
+        for moves in &mut soup {
             moves[rests + 1] = moves[rests];
         }
         let occluder = !random.one_in(3);

@@ -15,9 +15,10 @@
 //! - *Depth of a triangle.* Corners that move by 2 D in each coordinate move its plane by 2 sqrt(3) D along
 //!   the normal n, so the depth by 2 sqrt(3) D |n| / |n . d|. N and D of the solver are rounded, by e_N =
 //!   gamma(16) |n|' q' and e_D = gamma(12) |n|' (1 + |c|), with |n|' twice the product of the largest sides
-//!   and q' the reach of a corner; a depth is off by (e_N + z e_D) / |n . d|, and what is closer than twice
-//!   that, for either of two, counts as equal: 6 (e_N + z e_D) / |n . d| with the bulge of the band that
-//!   is taken for a line. No depth is beyond those of the corners.
+//!   and q' the reach of a corner; a depth is off by (e_N + z e_D) / |n . d|. What is closer than twice
+//!   that where D is least on a stretch, which is at most half of its largest, counts as equal, and so does a
+//!   band that is half as thick: 8 (e_N + z e_D) / |n . d| in all. No depth is beyond those of the corners,
+//!   but what counts as equal may be: where a triangle is fast, the solver's bound is that much too large.
 //! - *Depth of a sphere.* The same with the solver's noise of the root: 3 times D (1 + |c|) +
 //!   sqrt(noise) / k.
 
@@ -330,8 +331,11 @@ impl Along<'_> {
                 match self.cover_triangle(&corners).1 {
                     None => (nearest, farthest),
                     Some((a, b)) => {
-                        let off = self.triangle_error(p, q, &corners, b.max(0.0));
-                        ((a - off).clamp(nearest, farthest), (b + off).clamp(nearest, farthest))
+                        let (own, equal) = self.triangle_error(p, q, &corners, b.max(0.0));
+                        (
+                            (a - own).clamp(nearest, farthest) - equal,
+                            (b + own).clamp(nearest, farthest) + equal,
+                        )
                     }
                 }
             }
@@ -359,13 +363,14 @@ impl Along<'_> {
         }
     }
 
+    /// How far a triangle's depth may be off, and how far apart two may be that count as equal.
     fn triangle_error(
         &self,
         p: &[[f64; 3]; 3],
         q: &[[f64; 3]; 3],
         corners: &[[Near; 3]; 3],
         z: f64,
-    ) -> f64 {
+    ) -> (f64, f64) {
         let length = |v: [f64; 3]| (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
         let side = |p: &[[f64; 3]; 3], k: usize| -> [f64; 3] {
             std::array::from_fn(|i| p[k][i] - p[0][i])
@@ -386,7 +391,8 @@ impl Along<'_> {
         let moved = 2.0 * 3f64.sqrt() * self.judge.bounds.depth * length(n);
         let rounded =
             gamma(16) * normal_size * reach + z * gamma(12) * normal_size * (1.0 + self.c.abs());
-        (moved + 6.0 * rounded) / along + 4.0 * self.judge.bounds.depth
+        let depth = 2.0 * self.judge.bounds.depth;
+        ((moved + rounded) / along + depth, 7.0 * rounded / along + depth)
     }
 
     /// Compares the solver's answer at `t` with the exact one.

@@ -254,7 +254,7 @@ fn front_carried(random: &mut Random) -> MovingCase {
     let s = front_setting(random);
     let shell = sphere(random);
     let maps = in_front(random, &s, 1.0).map(|at| map(&s.pose, uniform(s.scale), at));
-    held(random, &s, &shell, &[shell.positions.clone()], &maps)
+    held(random, &s, &shell, std::slice::from_ref(&shell.positions), &maps)
 }
 
 fn front_turning(random: &mut Random) -> MovingCase {
@@ -269,7 +269,7 @@ fn front_turning(random: &mut Random) -> MovingCase {
     let turn = DQuat::from_axis_angle(random.direction(), random.within(-1.0..1.0));
     let first = DMat3::from_quat(random.rotation()) * s.scale;
     let maps = [map(&s.pose, first, a), map(&s.pose, DMat3::from_quat(turn) * shear * first, b)];
-    held(random, &s, &shell, &[shell.positions.clone()], &maps)
+    held(random, &s, &shell, std::slice::from_ref(&shell.positions), &maps)
 }
 
 fn front_scaled(random: &mut Random) -> MovingCase {
@@ -281,7 +281,7 @@ fn front_scaled(random: &mut Random) -> MovingCase {
         DMat3::from_diagonal(DVec3::new(side(), side(), side())) * s.scale
     };
     let maps = [map(&s.pose, sides(), a), map(&s.pose, sides(), b)];
-    held(random, &s, &shell, &[shell.positions.clone()], &maps)
+    held(random, &s, &shell, std::slice::from_ref(&shell.positions), &maps)
 }
 
 fn front_deforming(random: &mut Random) -> MovingCase {
