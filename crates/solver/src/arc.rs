@@ -159,11 +159,11 @@ impl Arc {
     }
 }
 
-/// What the root of a value v of a function is off by where that is off by `noise`: noise / sqrt(v), or
-/// the root of the noise where v is no more.
+/// What the root of a value v of a function is off by where that is off by `noise` either way: sqrt(v) -
+/// sqrt(v - noise), without cancellation; the root of the noise where v is no more.
 #[inline(always)]
 fn root_noise(v: f64, noise: f64) -> f64 {
-    if v > noise { noise / v.sqrt() } else { noise.sqrt() }
+    if v > noise { noise / (v.sqrt() + (v - noise).sqrt()) } else { noise.sqrt() }
 }
 
 /// Who is nearer, stretch by stretch.
@@ -287,34 +287,79 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
     let (from, to) = (largest(a.line.start, b.line.start), least(a.line.end, b.line.end));
     let (from, to) = (largest(from, 0.0), least(to, 1.0));
     let mut runs = Runs::default();
-    if from < to {
-        let (meeting, noise) = meeting(&a, &b, from, to);
-        let mut borders = [to; Polynomial::MOST + 2];
+    let sign = |t: f64| {
+        let ((p, p_error), (q, q_error)) = (a.depth(t), b.depth(t));
+        let (difference, noise) = (p - q, p_error + q_error);
+        i32::from(difference > noise) - i32::from(difference < -noise)
+    };
+    let with_ball = a.is_ball() || b.is_ball();
+    if with_ball {
+        // Where a sphere comes into sight it is steep, and what it passes there is passed at once.
+        (0..NEAR_ENDS).rev().for_each(|k| runs.push(from + share_of(k) * (to - from), from, &sign));
+    }
+    // One entry a level, and one more.
+    let mut stack = [(from, to, 0); LEVELS + 2];
+    let mut open = usize::from(from < to && !are_one(&a, &b));
+    while open > 0 {
+        open -= 1;
+        let (s, e, level) = stack[open];
+        let (meeting, noise) = meeting(&a, &b, s, e);
+        let mut borders = [e; Polynomial::MOST + 2];
         let mut count = 0;
-        meeting.sign_changes(noise, |at| {
+        let certain = meeting.sign_changes(noise, |at| {
             if count <= Polynomial::MOST {
-                borders[count] = from + at * (to - from);
+                borders[count] = s + at * (e - s);
                 count += 1;
             }
         });
-        let sign = |t: f64| {
-            let ((p, p_error), (q, q_error)) = (a.depth(t), b.depth(t));
-            let (difference, noise) = (p - q, p_error + q_error);
-            i32::from(difference > noise) - i32::from(difference < -noise)
-        };
-        let mut s = from;
-        for &e in &borders[..=count] {
-            if s < e {
-                // A change that hides in the noise of the polynomial shows at one of these.
+        // A sphere's polynomial has more than one factor: noise that is nothing beside one of them may
+        // hide another. On shorter stretches all are smaller.
+        if !certain && level < LEVELS && with_ball {
+            let middle = 0.5 * (s + e);
+            stack[open] = (middle, e, level + 1);
+            stack[open + 1] = (s, middle, level + 1);
+            open += 2;
+            continue;
+        }
+        let mut from = s;
+        for &to in &borders[..=count] {
+            if from < to {
+                // A change that hides in the noise shows at one of these.
                 for share in [1.0 / 64.0, 0.5, 63.0 / 64.0] {
-                    let at = s + share * (e - s);
-                    runs.push(at, s, sign(at));
+                    runs.push(from + share * (to - from), from, &sign);
                 }
             }
-            s = e;
+            from = to;
         }
     }
+    if with_ball {
+        (0..NEAR_ENDS).for_each(|k| runs.push(to - share_of(k) * (to - from), from, &sign));
+    }
     runs.order(lower_wins)
+}
+
+/// Places close to each end of a stretch at which two are compared.
+const NEAR_ENDS: i32 = 40;
+
+/// How far from the end they are, as a share of the stretch: under a 256th of it, each half as far as the
+/// one before.
+fn share_of(k: i32) -> f64 {
+    2.0f64.powi(-9 - k)
+}
+
+/// Halvings of a stretch on which a sphere's polynomial is noise.
+const LEVELS: usize = 8;
+
+/// True for two spheres that are one: equal wherever both are.
+fn are_one(a: &Curve, b: &Curve) -> bool {
+    let (Some(a), Some(b)) = (a.arc, b.arc) else { return false };
+    match (&a.shape, &b.shape) {
+        (
+            Shape::Ball { foot: p, g, from_inside, .. },
+            Shape::Ball { foot: q, g: h, from_inside: other, .. },
+        ) => (p, g, from_inside) == (q, h, other),
+        _ => false,
+    }
 }
 
 /// Stretches with the sign of the difference; what is equal, between.
@@ -329,17 +374,30 @@ struct Runs {
 }
 
 impl Runs {
-    /// The sign at `t`, behind a border at `border`, which is where it changes if it was another before
-    /// that.
-    fn push(&mut self, t: f64, border: f64, sign: i32) {
-        if sign == 0 {
+    /// Looks at `t`, later than before. `border` is where the sign changes if that is between: elsewhere
+    /// the change is looked for by halving.
+    fn push(&mut self, t: f64, border: f64, sign_at: &impl Fn(f64) -> i32) {
+        let sign = sign_at(t);
+        if sign == 0 || t <= self.seen {
             return;
         }
         if self.last == 0 {
             self.first = sign;
         } else if self.last != sign && self.count < Order::MOST {
-            let at = if self.seen < border { border } else { 0.5 * (self.seen + t) };
-            self.changes[self.count] = at;
+            let mut change = border;
+            if self.seen >= border {
+                let (mut before, mut behind) = (self.seen, t);
+                // Stops where neither is certain, or at a rounding.
+                for _ in 0..60 {
+                    change = 0.5 * (before + behind);
+                    match sign_at(change) {
+                        0 => break,
+                        s if s == sign => behind = change,
+                        _ => before = change,
+                    }
+                }
+            }
+            self.changes[self.count] = change;
             self.count += 1;
         }
         (self.last, self.seen) = (sign, t);

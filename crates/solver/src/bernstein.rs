@@ -163,8 +163,9 @@ impl Polynomial {
     }
 
     /// Calls `found` with the places in (0, 1) at which the polynomial changes its sign, ascending.
-    /// Values up to `noise` have no sign: a change through a stretch of them is in its middle.
-    pub fn sign_changes(&self, noise: f64, mut found: impl FnMut(f64)) {
+    /// Values up to `noise` have no sign: a change through a stretch of them is in its middle. False
+    /// when there are any but around a single root: what changes its sign twice may hide there.
+    pub fn sign_changes(&self, noise: f64, mut found: impl FnMut(f64)) -> bool {
         /// Halvings until a stretch is a rounding long.
         const LEVELS: u32 = 50;
         let sign = |v: f64| i32::from(v > noise) - i32::from(v < -noise);
@@ -184,6 +185,7 @@ impl Polynomial {
         // One entry a level, and one more.
         let mut stack = [(*self, 0.0, 1.0, 0u32); LEVELS as usize + 2];
         let mut open = 1;
+        let mut certain = true;
         while open > 0 {
             open -= 1;
             let (p, from, to, level) = stack[open];
@@ -199,8 +201,10 @@ impl Polynomial {
             }
             let (first, end) = (sign(b[0]), sign(b[p.degree]));
             if low >= 0 || high <= 0 {
+                certain &= b.iter().all(|b| b.abs() > noise);
                 note(from, low + high);
             } else if level == LEVELS {
+                certain = false;
                 note(from, first);
                 note(to, end);
             } else if changes == 1 && first * end < 0 {
@@ -215,6 +219,7 @@ impl Polynomial {
                 open += 2;
             }
         }
+        certain
     }
 
     /// The only root of a polynomial whose ends differ in sign.
