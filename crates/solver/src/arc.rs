@@ -11,9 +11,13 @@
 //!
 //! An arc is held between two lines parallel to its chord, a [`Band`]. Over a stretch that is split,
 //! bands get thinner with the square of its length, so who is nearer, and where that changes, is
-//! found by splitting until bands do not overlap: [`order`]. Where depths differ by less than the
+//! found by splitting until bands do not overlap: [`order`]. Arcs that run side by side would be split
+//! without end; their difference decides, [`side_by_side`]. Where depths differ by less than the
 //! rounding of both, the two are equal there; equal on all of what they share, the lower number is
 //! nearer, else what is beside it decides, as for lines.
+//!
+//! What rounding does to a depth depends on where on the arc it is: N / D is uncertain where D is small, a
+//! root where what it is of is. So a stretch on which that varies is split before it is called equal.
 //!
 //! Derivation of the bands. *Rational*: with the chord c(t) between the exact ends, N - c D is a cubic
 //! that is 0 at both ends, so at most 3/4 of the larger of its two inner coefficients, and |D| is at
