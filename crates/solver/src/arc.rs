@@ -12,7 +12,7 @@
 //! An arc is held between two lines parallel to its chord, a [`Band`]. Over a stretch that is split,
 //! bands get thinner with the square of its length, so who is nearer, and where that changes, is
 //! found by splitting until bands do not overlap: [`order`]. Arcs that run side by side would be split
-//! without end; their difference decides, [`side_by_side`]. Where depths differ by less than the
+//! without end; their difference decides, `side_by_side`. Where depths differ by less than the
 //! rounding of both, the two are equal there; equal on all of what they share, the lower number is
 //! nearer, else what is beside it decides, as for lines.
 //!
