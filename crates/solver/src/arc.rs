@@ -234,8 +234,8 @@ impl Curve<'_> {
 ///
 /// Two arcs that run side by side have bands that overlap until both are as thin as they are apart, which
 /// is never for two triangles of one plane. Their difference does not bend: of quotients it has the sign
-/// of `N D' - N' D`, of degree 5, times that of `D D'`; that of two spheres is at most the difference of
-/// their feet and of the roots of their g.
+/// of `N D' - N' D`, of degree 5, times that of `D D'`; that of two spheres is that of their feet, and that
+/// of their g by the sum of the roots.
 fn side_by_side(a: Curve, b: Curve, (s, e): (f64, f64), error: f64, noise: f64) -> Option<i32> {
     if let (Some(a), Some(b)) = (a.arc, b.arc)
         && let (
@@ -243,14 +243,31 @@ fn side_by_side(a: Curve, b: Curve, (s, e): (f64, f64), error: f64, noise: f64) 
             Shape::Ball { foot: k, g: h, from_inside: other, .. },
         ) = (&a.shape, &b.shape)
     {
-        let feet =
-            largest((linear(*f, s) - linear(*k, s)).abs(), (linear(*f, e) - linear(*k, e)).abs());
         let (g, h) = (quadratic_on(*g, s, e), quadratic_on(*h, s, e));
-        let apart = g.iter().zip(&h).fold(0.0, |most, (x, y)| largest(most, (x - y).abs()));
-        let low = g.iter().chain(&h).fold(f64::INFINITY, |low, v| least(low, *v));
-        // |sqrt(g) - sqrt(h)| = |g - h| / (sqrt(g) + sqrt(h)).
-        let roots = if low > apart { apart / (2.0 * low.sqrt()) } else { apart.sqrt() };
-        return (from_inside == other && feet + roots * inverse <= noise).then_some(0);
+        let ends = |v: &[f64]| {
+            v.iter()
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |m, v| (least(m.0, *v), largest(m.1, *v)))
+        };
+        let feet = ends(&[linear(*f, s) - linear(*k, s), linear(*f, e) - linear(*k, e)]);
+        let (in_g, in_h) = (ends(&g), ends(&h));
+        if from_inside != other || least(in_g.0, in_h.0) <= 0.0 {
+            let same = feet == (0.0, 0.0) && g == h && from_inside == other;
+            return same.then_some(0);
+        }
+        // sqrt(g) - sqrt(h) = (g - h) / (sqrt(g) + sqrt(h)).
+        let apart = ends(&[g[0] - h[0], g[1] - h[1], g[2] - h[2]]);
+        let sums = (in_g.0.sqrt() + in_h.0.sqrt(), in_g.1.sqrt() + in_h.1.sqrt());
+        let high = apart.1 * inverse / if apart.1 > 0.0 { sums.0 } else { sums.1 };
+        let low = apart.0 * inverse / if apart.0 < 0.0 { sums.0 } else { sums.1 };
+        let (low, high) = if *from_inside { (low, high) } else { (-high, -low) };
+        let (low, high) = (feet.0 + low, feet.1 + high);
+        return if low > noise {
+            Some(1)
+        } else if high < -noise {
+            Some(-1)
+        } else {
+            (low >= -noise && high <= noise).then_some(0)
+        };
     }
     let (n, d, n_error, d_error) = a.quotient(s, e)?;
     let (m, f, m_error, f_error) = b.quotient(s, e)?;
