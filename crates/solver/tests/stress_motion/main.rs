@@ -153,8 +153,11 @@ fn solve(case: &MovingCase, options: &SolveOptions) -> Vec<StateVisibility> {
     solve_states(geometry, segment, *sampling, states, *path, None, options)
 }
 
-/// All that is found: states, sets, weights to the bit.
-fn found(runs: &[StateVisibility]) -> Vec<(u32, u32, Vec<(u32, u32)>)> {
+/// First state, end, members with the bits of their weights.
+type Run = (u32, u32, Vec<(u32, u32)>);
+
+/// All that is found.
+fn found(runs: &[StateVisibility]) -> Vec<Run> {
     runs.iter()
         .map(|run| {
             let v = &run.visibility;
