@@ -42,11 +42,11 @@
 //! other, which the source excludes, [`crate::arc::order`].
 
 use glam::DVec3;
-use sightline_geometry::gamma;
+use sightline_geometry::{gamma, motion::lerp};
 
 use crate::{
     arc::{Arc, Shape},
-    bernstein::{cubic, cubic_on, cubic_sign_changes, linear, quadratic},
+    bernstein::{cubic_on, cubic_sign_changes, linear, quadratic, quadratic_on},
     bounds::ErrorBounds,
     envelope::{largest, least},
     quadratic::sign_changes,
@@ -402,40 +402,54 @@ impl<'a> MovingRow<'a> {
         covered: &mut impl FnMut(Covered),
     ) {
         let Covered { start, end, error } = whole;
-        let (n, d) = (self.triangle.n, self.d(c));
-        let (length, noise) = (end - start, self.triangle.n_error);
+        let length = end - start;
+        // On the stretch itself: what moves fast is far away at other times, and its N as uncertain as
+        // there. The corners are right to D, which moves the plane along its normal.
+        let [p, q] = &self.triangle.corners;
+        let at = |t: f64| [0, 1, 2].map(|k| lerp(p[k], q[k], t));
+        let here = MovingTriangle::new(at(start), at(end), 0.0);
+        if here.z.1 <= bounds.depth {
+            return;
+        }
+        if here.z.0 > bounds.depth {
+            covered(whole);
+            return;
+        }
+        let (n, d) = (here.n, here.normal.map(|n| n.x * c + (n.y * self.w + n.z)));
+        let noise = here.n_error + bounds.depth * here.normal_size;
+        // Shares of the stretch.
         let mut borders = Few::<f64, 5>::new();
-        borders.push(start);
-        cubic_sign_changes(cubic_on(n, start, end), noise, |at| {
+        borders.push(0.0);
+        cubic_sign_changes(n, noise, |at| {
             if borders.len < 4 {
-                borders.push(start + at * length);
+                borders.push(at);
             }
         });
-        borders.push(end);
-        let on = |t: f64| {
-            let z = cubic(n, t) / quadratic(d, t);
+        borders.push(1.0);
+        // The mean of N over a part, over that of D: at one place the camera may just touch the plane.
+        let on = |from: f64, to: f64| {
+            let (n, d) = (cubic_on(n, from, to), quadratic_on(d, from, to));
+            let z = (n.iter().sum::<f64>() / 4.0) / (d.iter().sum::<f64>() / 3.0);
             // D is 0 only where nothing is covered.
             if z.is_nan() { 0.0 } else { z }
         };
+        // The end at the camera plane is off by what moves N by its noise.
+        let own = |at: f64| {
+            if at == 0.0 || at == 1.0 {
+                return 0.0;
+            }
+            let slope = 3.0 * quadratic([n[1] - n[0], n[2] - n[1], n[3] - n[2]], at);
+            let bend = 3.0 * linear([n[2] - 2.0 * n[1] + n[0], n[3] - 2.0 * n[2] + n[1]], at);
+            length * least(root_error(slope, bend, 2.0 * noise), 1.0)
+        };
         for pair in borders.of().windows(2) {
             let (from, to) = (pair[0], pair[1]);
-            let middle = 0.5 * (from + to);
-            if from >= to || on(middle) <= bounds.depth {
+            if from >= to || on(from, to) <= bounds.depth {
                 continue;
             }
-            // The end at the camera plane is off by what moves N by its noise, and by that of corners
-            // that are off by D along the normal.
-            let moved = 2.0 * noise + bounds.depth * self.triangle.normal_size;
-            let own = |at: f64| {
-                if at == start || at == end {
-                    return 0.0;
-                }
-                let slope = 3.0 * quadratic([n[1] - n[0], n[2] - n[1], n[3] - n[2]], at);
-                let bend = 3.0 * linear([n[2] - 2.0 * n[1] + n[0], n[3] - 2.0 * n[2] + n[1]], at);
-                least(root_error(slope, bend, moved), 1.0)
-            };
             let error = largest(error, largest(own(from), own(to)));
-            covered(Covered { start: from, end: to, error });
+            let place = |at: f64| if at == 1.0 { end } else { start + at * length };
+            covered(Covered { start: place(from), end: place(to), error });
         }
     }
 
