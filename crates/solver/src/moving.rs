@@ -42,11 +42,11 @@
 //! other, which the source excludes, [`crate::arc::order`].
 
 use glam::DVec3;
-use sightline_geometry::gamma;
+use sightline_geometry::{gamma, motion::lerp};
 
 use crate::{
     arc::{Arc, Shape},
-    bernstein::{Polynomial, cubic, cubic_on, linear, quadratic},
+    bernstein::{Polynomial, cubic_on, linear, quadratic, quadratic_on},
     bounds::ErrorBounds,
     envelope::{largest, least},
     quadratic::sign_changes,
@@ -401,41 +401,97 @@ impl<'a> MovingRow<'a> {
         bounds: &ErrorBounds,
         covered: &mut impl FnMut(Covered),
     ) {
-        let Covered { start, end, error } = whole;
-        let (n, d) = (self.triangle.n, self.d(c));
-        let (length, noise) = (end - start, self.triangle.n_error);
-        let mut borders = Few::<f64, 5>::new();
-        borders.push(start);
-        Polynomial::new(&cubic_on(n, start, end)).sign_changes(noise, |at| {
-            if borders.len < 4 {
-                borders.push(start + at * length);
+        let Covered { mut start, mut end, mut error } = whole;
+        let [p, q] = &self.triangle.corners;
+        let at = |t: f64| [0, 1, 2].map(|k| lerp(p[k], q[k], t));
+        // Nothing is in front while all corners are behind: at one end at most, as the largest of three
+        // linear functions is convex.
+        let (first, last) = (at(start), at(end));
+        let behind = |p: &[DVec3; 3]| p.iter().all(|p| p.z <= 0.0);
+        if behind(&first) && behind(&last) {
+            return;
+        }
+        if behind(&first) || behind(&last) {
+            let from_start = behind(&first);
+            let mut border = (if from_start { 1.0 } else { 0.0 }, 0.0);
+            for k in 0..3 {
+                if (first[k].z > 0.0) != (last[k].z > 0.0) {
+                    let passes = crossing(first[k].z, last[k].z, bounds.depth);
+                    let sooner = (passes.0 < border.0) == from_start;
+                    border = if sooner { passes } else { border };
+                }
+            }
+            error = largest(error, border.1 * (end - start));
+            let place = start + border.0 * (end - start);
+            *(if from_start { &mut start } else { &mut end }) = place;
+            if start >= end {
+                return;
+            }
+        }
+        let whole = Covered { start, end, error };
+        let length = end - start;
+        // On the stretch itself: what moves fast is far away at other times, and its N as uncertain as
+        // there. The corners are right to D, which moves the plane along its normal.
+        let (first, last) = (at(start), at(end));
+        let here = MovingTriangle::new(first, last, 0.0);
+        if here.z.1 <= bounds.depth {
+            return;
+        }
+        if here.z.0 > bounds.depth {
+            covered(whole);
+            return;
+        }
+        let (n, d) = (here.n, here.normal.map(|n| n.x * c + (n.y * self.w + n.z)));
+        let noise = here.n_error + bounds.depth * here.normal_size;
+        // Shares of the stretch, at most two for D and three for N. D changes its sign where a triangle is
+        // turned over by being flat for an instant, which may be in the camera's place: then N does not.
+        let mut borders = Few::<f64, 8>::new();
+        borders.push(0.0);
+        let (count, flat) = sign_changes(d[0], d[1], d[2]);
+        flat[..count].iter().for_each(|&at| borders.push(at));
+        Polynomial::new(&n).sign_changes(noise, |at| {
+            if borders.len < 7 {
+                borders.push(at);
             }
         });
-        borders.push(end);
-        let on = |t: f64| {
-            let z = cubic(n, t) / quadratic(d, t);
+        borders.push(1.0);
+        let len = borders.len;
+        borders.items[..len].sort_by(f64::total_cmp);
+        // The mean of N over a part, over that of D: at one place the camera may just touch the plane.
+        let on = |from: f64, to: f64| {
+            let (n, d) = (cubic_on(n, from, to), quadratic_on(d, from, to));
+            let z = (n.iter().sum::<f64>() / 4.0) / (d.iter().sum::<f64>() / 3.0);
             // D is 0 only where nothing is covered.
             if z.is_nan() { 0.0 } else { z }
         };
-        for pair in borders.of().windows(2) {
-            let (from, to) = (pair[0], pair[1]);
-            let middle = 0.5 * (from + to);
-            if from >= to || on(middle) <= bounds.depth {
-                continue;
+        // An end at the camera plane is off by what moves N by its noise, and D by that of the sides.
+        let side = [first, last].iter().fold(0.0, |most, p| {
+            largest(most, largest((p[1] - p[0]).length(), (p[2] - p[0]).length()))
+        });
+        let wide = 1.0 + c.abs() + self.w.abs();
+        let d_noise = (gamma(12) * here.normal_size + 8.0 * bounds.depth * side) * wide;
+        let own = |at: f64| {
+            if at == 0.0 || at == 1.0 {
+                return 0.0;
             }
-            // The end at the camera plane is off by what moves N by its noise, and by that of corners
-            // that are off by D along the normal.
-            let moved = 2.0 * noise + bounds.depth * self.triangle.normal_size;
-            let own = |at: f64| {
-                if at == start || at == end {
-                    return 0.0;
-                }
+            let off = if flat[..count].contains(&at) {
+                let slope = 2.0 * linear([d[1] - d[0], d[2] - d[1]], at);
+                root_error(slope, d[0] - 2.0 * d[1] + d[2], d_noise)
+            } else {
                 let slope = 3.0 * quadratic([n[1] - n[0], n[2] - n[1], n[3] - n[2]], at);
                 let bend = 3.0 * linear([n[2] - 2.0 * n[1] + n[0], n[3] - 2.0 * n[2] + n[1]], at);
-                least(root_error(slope, bend, moved), 1.0)
+                root_error(slope, bend, 2.0 * noise)
             };
+            length * least(off, 1.0)
+        };
+        for pair in borders.of().windows(2) {
+            let (from, to) = (pair[0], pair[1]);
+            if from >= to || on(from, to) <= bounds.depth {
+                continue;
+            }
             let error = largest(error, largest(own(from), own(to)));
-            covered(Covered { start: from, end: to, error });
+            let place = |at: f64| if at == 1.0 { end } else { start + at * length };
+            covered(Covered { start: place(from), end: place(to), error });
         }
     }
 

@@ -19,6 +19,7 @@
 //!   that where D is least on a stretch, which is at most half of its largest, counts as equal, and so does a
 //!   band that is half as thick: 8 (e_N + z e_D) / |n . d| in all. No depth is beyond those of the corners,
 //!   but what counts as equal may be: where a triangle is fast, the solver's bound is that much too large.
+//! - *Camera.* A triangle is in front where its depth is positive, which is open within the same.
 //! - *Depth of a sphere.* The same with the solver's noise of the root: 3 times D (1 + |c|) +
 //!   sqrt(noise) / k.
 
@@ -81,6 +82,14 @@ enum Cover {
     Out,
     In(f64, f64),
     Maybe(f64, f64),
+}
+
+/// Whether a ray meets the inside of a triangle, in front of the camera or behind.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Edges {
+    Outside,
+    Inside,
+    Open,
 }
 
 /// Floats of a primitive at both ends of the path.
@@ -235,7 +244,15 @@ impl Along<'_> {
             Flat::Triangle([p, q]) => {
                 let corners: [[Near; 3]; 3] =
                     std::array::from_fn(|k| self.at(&p[k], &q[k], t, extra));
-                self.cover_triangle(&corners).0
+                let (edges, (low, high), plane) = self.cross_triangle(&corners);
+                let (from, to) = plane.map_or((low, high), |(a, b)| (a.max(low), b.min(high)));
+                match edges {
+                    Edges::Outside => Cover::Out,
+                    Edges::Open => Cover::Maybe(low, high),
+                    Edges::Inside if to <= 0.0 => Cover::Out,
+                    Edges::Inside if from > 0.0 => Cover::In(from, to),
+                    Edges::Inside => Cover::Maybe(from, to),
+                }
             }
             Flat::Sphere([p, q], radii) => {
                 self.cover_sphere(&self.at(p, q, t, extra), self.radius(radii, t))
@@ -247,8 +264,9 @@ impl Along<'_> {
         Near { v: (1.0 - t) * a + t * b, e: 8.0 * U * (a + b) + f64::MIN_POSITIVE }
     }
 
-    /// The cover, and the depth of the triangle's plane on the ray.
-    fn cover_triangle(&self, corners: &[[Near; 3]; 3]) -> (Cover, Option<(f64, f64)>) {
+    /// Whether the ray is inside of all edges, between which depths the corners are, and between which
+    /// the plane is on the ray.
+    fn cross_triangle(&self, corners: &[[Near; 3]; 3]) -> (Edges, (f64, f64), Option<(f64, f64)>) {
         let z = corners.map(|p| p[2]);
         let low = z.iter().fold(f64::INFINITY, |m, z| m.min(z.low()));
         let high = z.iter().fold(f64::NEG_INFINITY, |m, z| m.max(z.high()));
@@ -266,21 +284,16 @@ impl Along<'_> {
             let error = (n.e + v.abs() * d.e) / (d.v.abs() - d.e) + 4.0 * U * v.abs();
             (v - error, v + error)
         });
-        if high <= 0.0 || beside(g) || beside(h) {
-            return (Cover::Out, plane);
-        }
         let signs = e.map(Near::sign);
-        if signs.contains(&1) && signs.contains(&-1) {
-            return (Cover::Out, plane);
-        }
-        let (from, to) = plane.map_or((low, high), |(a, b)| (a.max(low), b.min(high)));
-        let cover = match signs.contains(&0) {
-            true => Cover::Maybe(low, high),
-            false if to <= 0.0 => Cover::Out,
-            false if from > 0.0 => Cover::In(from, to),
-            false => Cover::Maybe(from, to),
+        let both = signs.contains(&1) && signs.contains(&-1);
+        let edges = if high <= 0.0 || beside(g) || beside(h) || both {
+            Edges::Outside
+        } else if signs.contains(&0) {
+            Edges::Open
+        } else {
+            Edges::Inside
         };
-        (cover, plane)
+        (edges, (low, high), plane)
     }
 
     fn cover_sphere(&self, q: &[Near; 3], r: Near) -> Cover {
@@ -319,25 +332,27 @@ impl Along<'_> {
     /// How far a depth at t may be off for the solver, and the plane's own depth for a triangle.
     fn widened(&self, flat: &Flat, t: f64) -> Cover {
         let depth = self.judge.bounds.depth;
-        let cover = self.cover(flat, t, 2.0 * depth);
-        let (Cover::In(low, high) | Cover::Maybe(low, high)) = cover else { return cover };
-        let (low, high) = match flat {
+        let (certain, low, high) = match flat {
             Flat::Triangle([p, q]) => {
-                let corners: [[Near; 3]; 3] =
-                    std::array::from_fn(|k| self.at(&p[k], &q[k], t, 0.0));
-                let z = corners.map(|p| p[2].v);
-                let nearest = z.iter().fold(f64::INFINITY, |m, z| m.min(*z)) - 2.0 * depth;
-                let farthest = z.iter().fold(f64::NEG_INFINITY, |m, z| m.max(*z)) + 2.0 * depth;
-                match self.cover_triangle(&corners).1 {
+                let at = |extra: f64| -> [[Near; 3]; 3] {
+                    std::array::from_fn(|k| self.at(&p[k], &q[k], t, extra))
+                };
+                let (edges, (nearest, farthest), _) = self.cross_triangle(&at(2.0 * depth));
+                if edges == Edges::Outside {
+                    return Cover::Out;
+                }
+                let corners = at(0.0);
+                let (low, high) = match self.cross_triangle(&corners).2 {
                     None => (nearest, farthest),
                     Some((a, b)) => {
-                        let (own, equal) = self.triangle_error(p, q, &corners, b.max(0.0));
+                        let (own, equal) = self.triangle_error(p, q, &corners, b.abs());
                         (
                             (a - own).clamp(nearest, farthest) - equal,
                             (b + own).clamp(nearest, farthest) + equal,
                         )
                     }
-                }
+                };
+                (edges == Edges::Inside, low, high)
             }
             Flat::Sphere(centers, radii) => {
                 let k = 1.0 + self.c * self.c + self.w * self.w;
@@ -353,12 +368,17 @@ impl Along<'_> {
                 let noise = 2.0 * k.sqrt() * r * moved
                     + moved * moved
                     + gamma(8) * (k * r * r + off) * 1.01;
-                let off = 3.0 * (depth * (1.0 + self.c.abs()) + noise.sqrt() / k);
-                (low - off, high + off)
+                let error = 3.0 * (depth * (1.0 + self.c.abs()) + noise.sqrt() / k);
+                match self.cover(flat, t, 2.0 * depth) {
+                    Cover::Out => return Cover::Out,
+                    Cover::In(low, high) => (true, low - error, high + error),
+                    Cover::Maybe(low, high) => (false, low - error, high + error),
+                }
             }
         };
-        match cover {
-            Cover::In(..) if low > 0.0 => Cover::In(low, high),
+        match (certain, low > 0.0, high > 0.0) {
+            (.., false) => Cover::Out,
+            (true, true, _) => Cover::In(low, high),
             _ => Cover::Maybe(low, high),
         }
     }
@@ -467,10 +487,9 @@ impl Along<'_> {
                 let corners: [[Near; 3]; 3] =
                     std::array::from_fn(|k| self.at(&p[k], &q[k], t, extra));
                 let on_row = corners.iter().any(|p| p[1].minus(p[2].by(self.w)).sign() == 0);
-                match (self.cover_triangle(&corners).0, on_row) {
-                    (Cover::In(..), _) => Cause::Camera,
-                    (_, _) if !in_front => Cause::Camera,
-                    (_, true) => Cause::Row,
+                match self.cross_triangle(&corners).0 {
+                    Edges::Inside => Cause::Camera,
+                    _ if on_row => Cause::Row,
                     _ => Cause::Edge,
                 }
             }
