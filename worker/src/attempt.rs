@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use prost::Message;
-use sightline_geometry::{SegmentId, Timeline};
+use sightline_geometry::{SegmentId, Timeline, Units};
 use sightline_jobs::{Plan, TaskId, TaskKind};
 use sightline_proto::v1;
 use sightline_scene::Scene;
@@ -30,6 +30,7 @@ pub(crate) struct Bake {
     pub store: BakeStore,
     pub plan: Plan,
     timeline: Timeline,
+    units: Units,
     pub scene: Arc<Scene>,
     pub pool: SolvePool,
     cache: Mutex<PartCache>,
@@ -51,7 +52,8 @@ enum Inputs {
 impl Bake {
     pub fn new(store: BakeStore, plan: Plan, scene: Arc<Scene>, pool: SolvePool) -> Self {
         let timeline = plan.timeline();
-        Self { store, plan, timeline, scene, pool, cache: Mutex::default() }
+        let units = Units::new(&scene.geometry, plan.config.solver.granularity);
+        Self { store, plan, timeline, units, scene, pool, cache: Mutex::default() }
     }
 
     /// Attempts a task; on success its commit exists. Gives the time spent in computing.
@@ -87,9 +89,9 @@ impl Bake {
         inputs: &Inputs,
         cancel: &Cancel,
     ) -> Result<Vec<Part>, AttemptError> {
-        let Self { plan, scene, timeline, .. } = self;
+        let Self { plan, scene, timeline, units, .. } = self;
         let states = plan.states_of(task);
-        let work = Work { scene, timeline, config: &plan.config, states };
+        let work = Work { scene, timeline, config: &plan.config, units, states };
         let solved = match inputs {
             Inputs::Nothing => {
                 let segments = plan.segments_of(task);

@@ -2,7 +2,8 @@
 //!
 //! The set is the union of the sets of the cell's planned segments, which are solved at a low
 //! resolution and shared with its neighbours, and of the triangles that reach into the cell: those
-//! are visible from viewpoints close to them, whatever the perimeter sees. Then, in rounds:
+//! are visible from viewpoints close to them, whatever the perimeter sees. All sets are of whole units
+//! of the configured granularity. Then, in rounds:
 //!
 //! 1. *Measure.* Single rays from *held-out* viewpoints, random in the cell, that no segment was
 //!    chosen for, until [`ErrorTest`] says that the mean error is below the target with 95 %
@@ -289,10 +290,11 @@ pub fn finish_cell(
     planned: &PlannedCell,
     solved: &[(&ViewSegment, &[SegmentRow])],
 ) -> CellOutput {
-    let Work { scene, timeline, config, states } = work;
+    let Work { scene, timeline, config, units, states } = work;
     let (cell, accuracy) = (&planned.cell, &config.accuracy);
     let mut seen: Vec<StateSets> = solved.iter().map(|(_, rows)| sets_of(rows)).collect();
-    seen.push(primitives_in_cell_over(&scene.geometry, cell, states.clone()));
+    let inside = primitives_in_cell_over(&scene.geometry, cell, states.clone());
+    seen.push(inside.map(|set| units.around(&scene.geometry, set)));
     let sampling = Sampling::new(config.solver.rows);
     let mut sight = Sight {
         work,

@@ -13,7 +13,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 use sightline_geometry::{
-    InstancedGeometry, Sampling, SegmentId, StateSets, Timeline, ViewSegment,
+    InstancedGeometry, Sampling, SegmentId, StateSets, Timeline, Units, ViewSegment,
 };
 use sightline_jobs::{BakeConfig, PlannedCell};
 use sightline_scene::Scene;
@@ -35,6 +35,8 @@ pub struct Work<'a> {
     pub timeline: &'a Timeline,
     /// What is asked of the dataset.
     pub config: &'a BakeConfig,
+    /// What is visible as a whole, as the configuration asks for it.
+    pub units: &'a Units,
     /// The states of the task.
     pub states: Range<u32>,
 }
@@ -95,11 +97,12 @@ pub fn solve_segment(
     path: TimePath,
     known: Option<&StateSets>,
 ) -> Vec<SegmentRow> {
-    let Work { scene, config, .. } = work;
+    let Work { scene, config, units, .. } = *work;
     let sampling = sampling.jittered(segment.id.0);
     let options = SolveOptions {
         passes: if config.accuracy.rounds > 0 { PASSES } else { 0 },
         threshold: TILE_SHARE * config.accuracy.target_error,
+        units: Some(units),
         ..SolveOptions::default()
     };
     let row = |states: Range<u32>, found: SegmentVisibility| SegmentRow {

@@ -281,10 +281,11 @@ fn plan_one(scene: &Scene, config: BakeConfig) -> Plan {
 /// The rows of all cells of a plan, finished without tasks: range by range of states, then joined.
 fn finish_all(scene: &Scene, plan: &Plan) -> Vec<CellOutput> {
     let (never, timeline, mut ranges) = (Cancel::default(), plan.timeline(), Vec::new());
+    let units = &Units::new(&scene.geometry, plan.config.solver.granularity);
     let (all, a_task) = (plan.states(), plan.config.tasks.states_per_task);
     for first in (0..all).step_by(a_task as usize) {
         let states = first..all.min(first + a_task);
-        let work = Work { scene, timeline: &timeline, config: &plan.config, states };
+        let work = Work { scene, timeline: &timeline, config: &plan.config, units, states };
         let solved = solve_segments(&work, &plan.segments, &never).unwrap();
         let mut rows: BTreeMap<SegmentId, Vec<SegmentRow>> = BTreeMap::new();
         solved.into_iter().for_each(|row| rows.entry(row.segment).or_default().push(row));

@@ -25,6 +25,7 @@ pub mod raycast;
 mod set;
 mod state_sets;
 mod timeline;
+mod units;
 mod view;
 mod wide;
 
@@ -41,6 +42,7 @@ pub use raycast::{Hit, Ray};
 pub use set::{PrimitiveSet, Run};
 pub use state_sets::StateSets;
 pub use timeline::Timeline;
+pub use units::{CLUSTER_PRIMITIVES, Granularity, Units};
 pub use view::{ViewCell, ViewSegment};
 
 /// Unit roundoff of `f64`, 2^-53: the relative error of one correctly rounded operation.

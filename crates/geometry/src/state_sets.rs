@@ -97,6 +97,12 @@ impl StateSets {
         )
     }
 
+    /// Another set for each.
+    #[must_use]
+    pub fn map(&self, set: impl Fn(&PrimitiveSet) -> PrimitiveSet) -> Self {
+        Self::from_runs(self.runs.iter().map(|(states, own)| (states.clone(), set(own))))
+    }
+
     /// The same over more states: empty sets where there were none.
     ///
     /// # Panics

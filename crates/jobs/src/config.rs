@@ -11,6 +11,7 @@
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
+use sightline_geometry::Granularity;
 
 /// Everything a user can decide about a bake.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -112,6 +113,8 @@ pub struct SolverConfig {
     pub rings: u32,
     /// Whether the vertical edges of a cell are solved too.
     pub verticals: bool,
+    /// What is visible as a whole.
+    pub granularity: Granularity,
 }
 
 /// `[accuracy]`: the pixel error aimed at, and how it is measured and lowered.
@@ -165,7 +168,8 @@ impl Default for RegionConfig {
 
 impl Default for SolverConfig {
     fn default() -> Self {
-        Self { rows: 24, rows_max: 512, rings: 1, verticals: false }
+        let granularity = Granularity::Triangle;
+        Self { rows: 24, rows_max: 512, rings: 1, verticals: false, granularity }
     }
 }
 
@@ -315,6 +319,15 @@ pub const KEYS: &[KeyDoc] = &[
         "false",
         "",
         "Whether the vertical edges at the corners of a cell are solved too.",
+    ),
+    key(
+        "solver.granularity",
+        "\"triangle\", \"cluster\" or \"object\"",
+        "\"triangle\"",
+        "",
+        "What a cell sees or does not see as a whole: single primitives, clusters of at most 128 close \
+         primitives of one object, or objects. Larger units make larger sets and faster bakes: the solver \
+         stops looking where all that can be seen has been.",
     ),
     key(
         "accuracy.target_error",

@@ -14,6 +14,12 @@
 //! all states in which nothing that moves is seen there, and finds are kept with the set of states they
 //! are of, as bits.
 //!
+//! Where only units larger than a primitive are asked for ([`Units`]), finds are of units: a unit that a
+//! ray sees is seen whole, so far fewer are seen by one ray alone, and far less is refined. A unit is
+//! *settled* in a state once two rays have seen it, or when it was known before: nothing can make it more
+//! seen, nor missing. The passes behind the first do not look where all that reaches into a tile is
+//! settled. The weight of a unit is what the first pass that sees it finds: it looks everywhere.
+//!
 //! Source of the estimate: Good, "The population frequencies of species and the estimation of
 //! population parameters" (Biometrika 1953).
 //!
@@ -21,21 +27,22 @@
 //! - a pass depends on the ones before it alone, through sums of integers: the result is the same
 //!   on any number of threads (VI-3);
 //! - all weights of occluders add up to at most the whole: a ray's share of the directions is
-//!   divided between it and the finer rays around it.
+//!   divided between it and the finer rays around it (of primitives; units have weights of one pass);
+//! - to look no further changes neither which units are visible nor what may be missing.
 
 use rayon::prelude::*;
 use std::ops::Range;
 
 use sightline_geometry::{
-    FACE_COUNT, InstancedGeometry, PrimitiveId, PrimitiveSet, RectifiedFrame, Sampling, StateSets,
-    ViewSegment,
+    FACE_COUNT, Granularity, InstancedGeometry, PrimitiveId, PrimitiveSet, RectifiedFrame, Run,
+    Sampling, StateSets, Units, ViewSegment,
 };
 
 use crate::{
     bounds::ErrorBounds,
     envelope::Column,
     states::{StateVisibility, TimePath},
-    tile::{Motion, TILE_COLUMNS, TILE_ROWS, TileContext, TileCounters, TileSolver, When},
+    tile::{Motion, Settled, TILE_COLUMNS, TILE_ROWS, TileContext, TileCounters, TileSolver, When},
 };
 
 /// Weights are summed in units of 2^-60 of the whole (directions x segment), as integers: the
@@ -52,7 +59,7 @@ pub struct SegmentVisibility {
     /// The visible primitives.
     pub set: PrimitiveSet,
     /// For each member of the set, ascending: the share of (directions x segment) on which it is
-    /// visible, in (0, 1].
+    /// visible, in (0, 1]. Members of a larger unit have equal parts of its share.
     pub weights: Vec<f32>,
     /// The share of (directions x segment) on which something is seen that is missing in the set,
     /// as far as the last passes can tell.
@@ -78,6 +85,10 @@ pub struct SolveOptions<'a> {
     /// Do without temporal bounding volumes: what moves is looked at in every state. The result is the
     /// same.
     pub without_volumes: bool,
+    /// What is visible as a whole; absent: every primitive for itself.
+    pub units: Option<&'a Units>,
+    /// Look on where all that can be seen has been. The result is the same.
+    pub exhaustive: bool,
 }
 
 /// States that are solved together: the bits of a [`States`].
@@ -99,7 +110,7 @@ struct Tile {
     states: States,
 }
 
-/// A primitive in a tile, or in several.
+/// A primitive, or a unit by its first, in a tile, or in several.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Find {
     primitive: u32,
@@ -155,13 +166,14 @@ impl Grid {
     }
 
     /// What a tile's rays see, ascending. `time` is the first of the states that are solved together,
-    /// and how camera and time are coupled.
+    /// and how camera and time are coupled. Units come with what of them is settled, if anything is.
     fn solve(
         &self,
         context: &TileContext,
         solver: &mut TileSolver,
         tile: &Tile,
         time: Option<(u32, TimePath, bool)>,
+        units: Option<(&Units, Option<&Settled>)>,
     ) -> Finds {
         let sampling = self.sampling;
         let first_row = tile.row * TILE_ROWS as u32;
@@ -169,6 +181,10 @@ impl Grid {
         let end_row = sampling.rows().min(first_row + TILE_ROWS as u32);
         let rows: Vec<f64> = (first_row..end_row).map(|i| sampling.row(i)).collect();
         let columns = &self.columns[first_column as usize..][..TILE_COLUMNS];
+        let settled = units.and_then(|(_, settled)| settled);
+        if settled.is_some_and(|settled| solver.meets_only(settled, context, &rows, columns)) {
+            return Finds::new();
+        }
         let angles = solid_angles(sampling, first_row..end_row, first_column);
         let first_state = time.map_or(0, |t| t.0);
         let numbers: Vec<u32> = members(tile.states).map(|bit| first_state + bit).collect();
@@ -177,9 +193,17 @@ impl Grid {
         let mut seen: Vec<(u64, u64)> = Vec::new();
         let mut current = When::Always;
         let mut finds = Finds::new();
+        // Neighbours in space are often of one unit.
+        let mut unit = 0..0;
         // Where the finds of the state before begin.
         let (mut begin, mut own_states) = (0, 0);
-        solver.solve(context, &rows, columns, motion, |when, primitive, pixel, length| {
+        solver.solve(context, &rows, columns, motion, |when, mut primitive, pixel, length| {
+            if let Some((units, _)) = units {
+                if !unit.contains(&primitive) {
+                    unit = units.of(context.geometry, PrimitiveId(primitive));
+                }
+                primitive = unit.start;
+            }
             if when != current {
                 flush(&mut seen, current, first_state, &mut finds, &mut begin, &mut own_states);
                 current = when;
@@ -266,14 +290,40 @@ fn by_primitive(finds: &[Find]) -> impl Iterator<Item = &[Find]> {
     finds.chunk_by(|a, b| a.primitive == b.primitive)
 }
 
-/// The states in which exactly one ray sees a primitive, from its finds.
-fn seen_once(finds: &[Find]) -> States {
+/// The states in which exactly one ray sees a primitive, and those in which more do, from its finds.
+fn seen_once_or_more(finds: &[Find]) -> (States, States) {
     let (mut once, mut more) = (0, 0);
     for find in finds.iter().filter(|find| find.rays > 0) {
         more |= if find.rays > 1 { find.states } else { once & find.states };
         once |= find.states;
     }
-    once & !more
+    (once & !more, more)
+}
+
+/// Adds the weights that a tile's finds have, to its own share of the directions: what finer rays look at
+/// again weighs a fifth, as one ray of five.
+fn weigh(found: &mut Finds, finds: &Finds, tile: &Tile, refined: States) {
+    for find in finds {
+        let shares = [(!refined, tile.share), (refined, 0.2 * tile.share)];
+        for (states, share) in shares.map(|(s, share)| (s & find.states, share)) {
+            if states != 0 {
+                let weight = (find.weight as f64 * share) as u64;
+                found.push(Find { rays: 0, states, weight, ..*find });
+            }
+        }
+    }
+}
+
+/// Adds the weights of units that no pass before has seen. `before` has what those saw, ascending.
+fn weigh_units(found: &mut Finds, finds: &Finds, tile: &Tile, before: &[(u32, States)]) {
+    for find in finds {
+        let at = before.binary_search_by_key(&find.primitive, |b| b.0);
+        let states = find.states & !at.map_or(0, |k| before[k].1);
+        if states != 0 {
+            let weight = (find.weight as f64 * tile.share) as u64;
+            found.push(Find { rays: 0, states, weight, ..*find });
+        }
+    }
 }
 
 /// Finds the primitives visible from a segment, along the rays of `sampling`.
@@ -325,6 +375,7 @@ impl Solve<'_> {
         let Some(frame) = RectifiedFrame::new(segment) else { return Vec::new() };
         let bounds = ErrorBounds::new(geometry, &frame);
         let threshold = (options.threshold.clamp(0.0, 1.0) * WEIGHT_UNIT) as u64;
+        let units = options.units.filter(|u| u.granularity() != Granularity::Triangle);
         let count = states.end - states.start;
         let all: States = States::MAX >> (STATES_AT_ONCE - count);
         let moves = geometry.has_motion() || !geometry.particles.is_empty();
@@ -348,6 +399,9 @@ impl Solve<'_> {
         // Rays that see a primitive, and its weight; ascending.
         let mut found = Finds::new();
         let mut missing = vec![0.0; count as usize];
+        // What the passes before saw, and in which states.
+        let mut before: Vec<(u32, States)> = Vec::new();
+        let mut settled: Option<Settled> = None;
         for pass in 0..=options.passes {
             let solved: Vec<(Finds, TileCounters)> = tiles
                 .par_iter()
@@ -357,7 +411,8 @@ impl Solve<'_> {
                     solver.portable = options.portable;
                     let face = frame.face(tile.face);
                     let context = TileContext { geometry, frame: &frame, face, bounds: &bounds };
-                    let finds = grid.solve(&context, solver, tile, time);
+                    let units = units.map(|units| (units, settled.as_ref()));
+                    let finds = grid.solve(&context, solver, tile, time, units);
                     (finds, solver.counters)
                 })
                 .collect();
@@ -368,12 +423,19 @@ impl Solve<'_> {
             }
             join(&mut found);
             let mut alone_in: Vec<(u32, States)> = Vec::new();
+            let mut done = Vec::new();
             for of_one in by_primitive(&found) {
-                let states = seen_once(of_one);
-                if states != 0 {
-                    let primitive = of_one[0].primitive;
-                    alone_in.push((primitive, states & !known_in(primitive)));
+                let (once, more) = seen_once_or_more(of_one);
+                let primitive = of_one[0].primitive;
+                if once != 0 {
+                    alone_in.push((primitive, once & !known_in(primitive)));
                 }
+                if units.is_some() && more == all {
+                    done.push(primitive);
+                }
+            }
+            if let Some(units) = units.filter(|_| !options.exhaustive) {
+                settled = Some(Settled::new(geometry, units, &done, known, states));
             }
             let finer = Grid::new(grid.sampling.finer(), &frame, &bounds);
             let mut next = Vec::new();
@@ -398,32 +460,35 @@ impl Solve<'_> {
                 if refined != 0 {
                     next.extend(finer.inside(tile, 0.8 * tile.share, refined));
                 }
-                for find in finds {
-                    let shares = [(!refined, tile.share), (refined, 0.2 * tile.share)];
-                    for (states, share) in shares.map(|(s, share)| (s & find.states, share)) {
-                        if states != 0 {
-                            let weight = (find.weight as f64 * share) as u64;
-                            found.push(Find { rays: 0, states, weight, ..*find });
-                        }
-                    }
+                match units {
+                    None => weigh(&mut found, finds, tile, refined),
+                    Some(_) => weigh_units(&mut found, finds, tile, &before),
                 }
             }
             join(&mut found);
+            if units.is_some() {
+                before = by_primitive(&found)
+                    .map(|of_one| (of_one[0].primitive, of_one.iter().fold(0, |s, f| s | f.states)))
+                    .collect();
+            }
             if next.is_empty() {
                 break;
             }
             (grid, tiles) = (finer, next);
         }
-        runs(&found, states, &missing, statistics)
+        runs(&found, states, &missing, statistics, |first| {
+            units.map_or(first..first + 1, |units| units.of(geometry, PrimitiveId(first)))
+        })
     }
 }
 
-/// Finds as runs of states with equal results.
+/// Finds as runs of states with equal results. `unit` gives the primitives of a unit, by its first.
 fn runs(
     found: &[Find],
     states: &Range<u32>,
     missing: &[f64],
     statistics: TileCounters,
+    unit: impl Fn(u32) -> Range<u32>,
 ) -> Vec<StateVisibility> {
     // Bit k: something differs between states k and k + 1.
     let mut differs = 0;
@@ -440,7 +505,7 @@ fn runs(
         if equal {
             continue;
         }
-        let mut members = Vec::new();
+        let mut set = PrimitiveSet::default();
         let mut weights: Vec<f32> = Vec::new();
         for of_one in by_primitive(found) {
             let here = of_one.iter().filter(|f| f.states >> first & 1 == 1);
@@ -450,16 +515,15 @@ fn runs(
                 weight = weight.saturating_add(find.weight);
             }
             if any {
-                members.push(of_one[0].primitive);
-                weights.push((weight as f64 / WEIGHT_UNIT) as f32);
+                let Range { start: first, end } = unit(of_one[0].primitive);
+                set.push(Run { first, end });
+                let parts = f64::from(end - first);
+                let part = (weight as f64 / WEIGHT_UNIT / parts) as f32;
+                weights.extend((first..end).map(|_| part));
             }
         }
-        let visibility = SegmentVisibility {
-            set: PrimitiveSet::from_sorted(members),
-            weights,
-            missing: missing[first as usize],
-            statistics,
-        };
+        let visibility =
+            SegmentVisibility { set, weights, missing: missing[first as usize], statistics };
         let run = states.start + first..states.start + last + 1;
         match out.last_mut() {
             Some(before) if before.visibility == visibility => before.states.end = run.end,

@@ -25,6 +25,7 @@
 //! rounding of either side, so what is skipped is behind by more than the error bound.
 
 mod moving;
+mod settled;
 
 use std::cmp::Ordering;
 
@@ -39,6 +40,8 @@ use crate::{
     envelope::{BINS, Column, Envelopes, Interval, Line, bin_of, largest, least},
     states::TimePath,
 };
+
+pub use settled::Settled;
 
 /// Most rows of a tile. Small tiles have tight beams, large ones share a walk; these are the
 /// fastest measured, with little between them and their neighbours.
@@ -287,19 +290,10 @@ impl TileSolver {
         motion: Option<Motion>,
         mut found: impl FnMut(When, u32, usize, f64),
     ) {
-        assert!(w.len() <= TILE_ROWS && c.len() == TILE_COLUMNS);
         let pixels = w.len() * TILE_COLUMNS;
         self.counters.rays += pixels as u64;
-        self.rows.clear();
-        self.rows.extend_from_slice(w);
-        self.columns.clear();
-        self.columns.extend_from_slice(c);
-        let (rows, columns) = ((w[0], w[w.len() - 1]), (c[0].c, c[TILE_COLUMNS - 1].c));
-        self.wedge = Wedge::new(context.frame.length, rows, columns, context.bounds.depth);
+        self.aim(context, w, c);
         self.envelopes.clear(pixels);
-        self.row_far.clear();
-        self.row_far.resize(w.len(), Far::default());
-        self.tile_far = Far::default();
         self.seen_through.clear();
 
         self.walk(context, &context.geometry.occluders, Pass::Occluders);
@@ -310,6 +304,21 @@ impl TileSolver {
         if let Some(motion) = motion {
             self.solve_motion(context, &motion, pixels, &mut found);
         }
+    }
+
+    /// Takes the beam of these rows and columns, with nothing found in it.
+    #[inline(always)]
+    fn aim(&mut self, context: &TileContext, w: &[f64], c: &[Column]) {
+        assert!(w.len() <= TILE_ROWS && c.len() == TILE_COLUMNS);
+        self.rows.clear();
+        self.rows.extend_from_slice(w);
+        self.columns.clear();
+        self.columns.extend_from_slice(c);
+        let (rows, columns) = ((w[0], w[w.len() - 1]), (c[0].c, c[TILE_COLUMNS - 1].c));
+        self.wedge = Wedge::new(context.frame.length, rows, columns, context.bounds.depth);
+        self.row_far.clear();
+        self.row_far.resize(w.len(), Far::default());
+        self.tile_far = Far::default();
     }
 
     /// Calls `found` with the intervals of a pixel of the last state that was solved.
@@ -464,31 +473,47 @@ impl TileSolver {
         }
     }
 
-    /// Walks both levels of a hierarchy front to back.
+    /// Starts a walk at the root of a top level, in space 0; `None` when there is nothing.
     #[inline(always)]
-    fn walk(&mut self, context: &TileContext, top: &TopLevel, pass: Pass) {
-        let Some(root) = top.hierarchy.nodes.first() else { return };
-        let geometry = context.geometry;
+    fn enter_world(&mut self, context: &TileContext, top: &TopLevel) -> Option<DMat3> {
+        let root = top.hierarchy.nodes.first()?;
         let face_from_world = context.face.face_from_world();
-        let offset = face_from_world * (geometry.origin - context.frame.v0);
+        let offset = face_from_world * (context.geometry.origin - context.frame.v0);
         self.spaces.clear();
         self.stack.clear();
         let space = self.space(context, face_from_world, offset, InstanceId(u32::MAX));
         self.spaces.push(space);
-        if let Some(entry) = self.test(context, 0, 0, root) {
-            self.stack.push(entry);
+        let entry = self.test(context, 0, 0, root);
+        self.stack.extend(entry);
+        Some(face_from_world)
+    }
+
+    /// The nodes that a walk numbers in one of its spaces.
+    #[inline(always)]
+    fn nodes_of<'a>(
+        &self,
+        geometry: &'a InstancedGeometry,
+        top: &'a TopLevel,
+        space: u32,
+    ) -> &'a [Node] {
+        if space == 0 {
+            return &top.hierarchy.nodes;
         }
+        let instance = self.spaces[space as usize].instance;
+        let mesh = geometry.instances[instance.index()].mesh;
+        &geometry.meshes[mesh.index()].hierarchy.nodes
+    }
+
+    /// Walks both levels of a hierarchy front to back.
+    #[inline(always)]
+    fn walk(&mut self, context: &TileContext, top: &TopLevel, pass: Pass) {
+        let geometry = context.geometry;
+        let Some(face_from_world) = self.enter_world(context, top) else { return };
         while let Some(entry) = self.stack.pop() {
             if self.is_hidden(&entry) {
                 continue;
             }
-            let nodes = if entry.space == 0 {
-                &top.hierarchy.nodes
-            } else {
-                let instance = self.spaces[entry.space as usize].instance;
-                let mesh = geometry.instances[instance.index()].mesh;
-                &geometry.meshes[mesh.index()].hierarchy.nodes
-            };
+            let nodes = self.nodes_of(geometry, top, entry.space);
             let node = nodes[entry.node as usize];
             let items = node.first as usize..(node.first + node.count) as usize;
             if !node.is_leaf() {
