@@ -129,7 +129,9 @@ struct Sight<'a> {
     stops: Vec<f64>,
     /// The mean error before the last round's run, when it made one.
     before_run: Option<f64>,
+    /// Rays of the solver, and movers that it skipped.
     solver_rays: u64,
+    skipped_movers: u64,
     heldout_rays: u64,
 }
 
@@ -270,7 +272,10 @@ impl Sight<'_> {
                 Extra { rows, segment }
             })
             .collect();
-        self.solver_rays += seen.iter().flat_map(|e| &e.rows).map(|row| row.rays).sum::<u64>();
+        for row in seen.iter().flat_map(|e| &e.rows) {
+            self.solver_rays += row.rays;
+            self.skipped_movers += row.skipped_movers;
+        }
         let whole = self.sets.states();
         let mut all: Vec<StateSets> =
             seen.iter().map(|e| sets_of(&e.rows).padded(whole.clone())).collect();
@@ -309,6 +314,11 @@ pub fn finish_cell(
         stops: Vec::new(),
         before_run: None,
         solver_rays: solved.iter().flat_map(|(_, rows)| *rows).map(|row| row.rays).sum(),
+        skipped_movers: solved
+            .iter()
+            .flat_map(|(_, rows)| *rows)
+            .map(|row| row.skipped_movers)
+            .sum(),
         heldout_rays: 0,
     };
     drop(seen);
@@ -334,6 +344,7 @@ pub fn finish_cell(
         lines: sight.lines,
         rows: sight.rows,
         solver_rays: sight.solver_rays,
+        skipped_movers: sight.skipped_movers,
         refinements: round,
         heldout_viewpoints: u32::try_from(found.test.rays()).unwrap_or(u32::MAX),
         heldout_rays: sight.heldout_rays,

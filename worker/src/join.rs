@@ -125,6 +125,7 @@ fn effort_of<'a>(timeline: &Timeline, ranges: impl Iterator<Item = &'a Stretch<'
             lines: sum.lines + one.lines,
             rows: sum.rows.max(one.rows),
             solver_rays: sum.solver_rays + one.solver_rays,
+            skipped_movers: sum.skipped_movers + one.skipped_movers,
             refinements: sum.refinements + one.refinements,
             heldout_viewpoints: sum.heldout_viewpoints.saturating_add(one.heldout_viewpoints),
             heldout_rays: sum.heldout_rays + one.heldout_rays,

@@ -112,6 +112,7 @@ pub fn solve_segment(
         set: found.set,
         weights: found.weights,
         rays: found.statistics.rays,
+        skipped_movers: found.statistics.skipped,
     };
     if is_at_rest(&scene.geometry) {
         let options = SolveOptions { known: known.map(|sets| sets.at(states.start)), ..options };

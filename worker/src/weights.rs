@@ -173,7 +173,15 @@ mod tests {
     fn row(members: &[u32], weights: &[f32]) -> SegmentRow {
         let set = PrimitiveSet::from_sorted(members.iter().copied());
         let (segment, weights) = (SegmentId(0), weights.to_vec());
-        SegmentRow { segment, first_state: 0, last_state: 0, set, weights, rays: 64 }
+        SegmentRow {
+            segment,
+            first_state: 0,
+            last_state: 0,
+            set,
+            weights,
+            rays: 64,
+            skipped_movers: 0,
+        }
     }
 
     #[test]

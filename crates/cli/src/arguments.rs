@@ -260,7 +260,14 @@ pub struct Export {
     /// The cell.
     #[arg(long, value_name = "ID", value_parser = parse_cell)]
     pub cell: CellId,
-    /// Write only the so many most important triangles.
+    /// Write what is seen in this state of a moving scene, as it stands at the state's key frame;
+    /// otherwise what is seen in any state, as at the first.
+    #[arg(long, value_name = "N", conflicts_with = "time")]
+    pub state: Option<u32>,
+    /// Write what is seen in the state at this time, as it stands then; in seconds.
+    #[arg(long, value_name = "SECONDS", allow_hyphen_values = true)]
+    pub time: Option<f64>,
+    /// Write only the so many most important primitives.
     #[arg(long, value_name = "N", value_parser = parse_count)]
     pub budget: Option<u64>,
     /// The file to write.

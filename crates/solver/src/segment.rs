@@ -64,7 +64,7 @@ pub struct SegmentVisibility {
     /// The share of (directions x segment) on which something is seen that is missing in the set,
     /// as far as the last passes can tell.
     pub missing: f64,
-    /// What it took.
+    /// What it took; of several runs of states that were solved together, the first has all.
     pub statistics: Statistics,
 }
 
@@ -522,11 +522,15 @@ fn runs(
                 weights.extend((first..end).map(|_| part));
             }
         }
-        let visibility =
-            SegmentVisibility { set, weights, missing: missing[first as usize], statistics };
+        let missing = missing[first as usize];
+        // What it took is counted once.
+        let statistics = if first == 0 { statistics } else { TileCounters::default() };
+        let visibility = SegmentVisibility { set, weights, missing, statistics };
         let run = states.start + first..states.start + last + 1;
         match out.last_mut() {
-            Some(before) if before.visibility == visibility => before.states.end = run.end,
+            Some(before) if before.visibility.same_result(&visibility) => {
+                before.states.end = run.end
+            }
             _ => out.push(StateVisibility { states: run, visibility }),
         }
         first = last + 1;

@@ -71,7 +71,10 @@ pub fn solve_states(
     }
     out.dedup_by(|b, a| {
         let same = a.visibility.same_result(&b.visibility);
-        a.states.end = if same { b.states.end } else { a.states.end };
+        if same {
+            a.states.end = b.states.end;
+            a.visibility.statistics = a.visibility.statistics.plus(b.visibility.statistics);
+        }
         same
     });
     out

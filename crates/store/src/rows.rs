@@ -29,6 +29,9 @@ pub struct SegmentRow {
     pub weights: Vec<f32>,
     /// Rays along which it was solved.
     pub rays: u64,
+    /// Moving objects and particles in states in which they were not looked at, as a volume that holds
+    /// them was hidden: a sum over the tiles of the solve.
+    pub skipped_movers: u64,
 }
 
 impl SegmentRow {
@@ -74,6 +77,9 @@ pub struct CellEffort {
     /// Rays along which the segments were solved, finer ones included. A shared segment counts for
     /// each of its cells.
     pub solver_rays: u64,
+    /// Moving objects and particles in states in which they were not looked at, as a volume that holds
+    /// them was hidden: a sum over the tiles of all segments.
+    pub skipped_movers: u64,
     /// Refinement rounds that were run.
     pub refinements: u32,
     /// Viewpoints of the last measurement, which the errors are from.
@@ -99,6 +105,7 @@ impl Default for CellEffort {
             lines: 0,
             rows: 0,
             solver_rays: 0,
+            skipped_movers: 0,
             refinements: 0,
             heldout_viewpoints: 0,
             heldout_rays: 0,

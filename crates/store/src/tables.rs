@@ -122,6 +122,11 @@ const CELL_COLUMNS: &[Column] = &[
     ("lines", Kind::U32, "of these, lines through viewpoints"),
     ("rows", Kind::U32, "rows of a face of the finest run"),
     ("solver_rays", Kind::U64, "rays along which the segments were solved"),
+    (
+        "skipped_movers",
+        Kind::U64,
+        "movers in states in which a hidden volume holds them, a tile each",
+    ),
     ("refinements", Kind::U32, "refinement rounds"),
     ("heldout_viewpoints", Kind::U32, "viewpoints of the last measurement"),
     ("heldout_rays", Kind::U64, "rays cast from held-out viewpoints, in all rounds"),
@@ -146,7 +151,7 @@ const CELL_COLUMNS_OF_2: &[&str] = &[
 ];
 
 /// Columns of [`CELL_COLUMNS`] and of the index that version 2 did not have.
-const STATE_COLUMNS: &[&str] = &["first_state", "last_state"];
+const STATE_COLUMNS: &[&str] = &["first_state", "last_state", "skipped_movers"];
 
 /// What segments tasks write.
 pub(crate) const SEGMENT_PART: Table = Table {
@@ -171,6 +176,11 @@ pub(crate) const SEGMENT_PART: Table = Table {
              nearest",
         ),
         ("rays", Kind::U64, "rays along which the segment was solved"),
+        (
+            "skipped_movers",
+            Kind::U64,
+            "movers in states in which a hidden volume holds them, a tile each",
+        ),
     ],
 };
 
@@ -608,6 +618,7 @@ pub(crate) fn segment_batch(row: &SegmentRow) -> Result<RecordBatch> {
         sets([&row.set].into_iter()),
         Arc::new(weights.finish()),
         numbers::<UInt64Type>([row.rays].into_iter()),
+        numbers::<UInt64Type>([row.skipped_movers].into_iter()),
     ])
 }
 
@@ -628,6 +639,7 @@ pub(crate) fn cell_batch(table: &Table, rows: &[CellRow]) -> Result<RecordBatch>
         numbers::<UInt32Type>(rows.iter().map(|r| r.effort.lines)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.effort.rows)),
         numbers::<UInt64Type>(rows.iter().map(|r| r.effort.solver_rays)),
+        numbers::<UInt64Type>(rows.iter().map(|r| r.effort.skipped_movers)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.effort.refinements)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.effort.heldout_viewpoints)),
         numbers::<UInt64Type>(rows.iter().map(|r| r.effort.heldout_rays)),
@@ -846,6 +858,7 @@ pub(crate) fn segment_rows(
     let sets = columns.get::<BinaryArray>("set")?;
     let weights = columns.get::<ListArray>("weights")?;
     let rays = columns.numbers::<UInt64Type>("rays")?;
+    let skipped_movers = columns.numbers::<UInt64Type>("skipped_movers")?;
     let states = columns.states()?;
     for (row, &id) in ids.iter().enumerate() {
         let segment = SegmentId(id);
@@ -861,7 +874,16 @@ pub(crate) fn segment_rows(
             return Err(StoreError::corrupt(file, problem));
         }
         let [first_state, last_state] = states(row)?;
-        rows.push(SegmentRow { segment, first_state, last_state, set, weights, rays: rays[row] });
+        let (rays, skipped_movers) = (rays[row], skipped_movers[row]);
+        rows.push(SegmentRow {
+            segment,
+            first_state,
+            last_state,
+            set,
+            weights,
+            rays,
+            skipped_movers,
+        });
     }
     Ok(())
 }
@@ -908,6 +930,10 @@ fn cell_efforts(columns: &Columns<'_>) -> Result<Vec<CellEffort>> {
     let lines = columns.u32s("lines")?;
     let rows = columns.u32s("rows")?;
     let solver_rays = columns.numbers::<UInt64Type>("solver_rays")?;
+    let skipped_movers = match columns.has("skipped_movers") {
+        true => Some(columns.numbers::<UInt64Type>("skipped_movers")?),
+        false => None,
+    };
     let heldout_viewpoints = columns.u32s("heldout_viewpoints")?;
     let error_upper = columns.f64s("heldout_error_upper")?;
     let target_met = columns.get::<BooleanArray>("target_met")?;
@@ -916,6 +942,7 @@ fn cell_efforts(columns: &Columns<'_>) -> Result<Vec<CellEffort>> {
         lines: lines[row],
         rows: rows[row],
         solver_rays: solver_rays[row],
+        skipped_movers: skipped_movers.map_or(0, |skipped_movers| skipped_movers[row]),
         heldout_viewpoints: heldout_viewpoints[row],
         heldout_error_upper: error_upper[row],
         target_met: target_met.value(row),

@@ -160,6 +160,8 @@ pub struct Summary {
     pub segments: u64,
     /// Rays of the solver's grids over all cells; those of shared segments for each cell.
     pub solver_rays: u64,
+    /// Moving objects and particles in states in which they were skipped, over the tiles of all cells.
+    pub skipped_movers: u64,
     /// Held-out pixel error of the worst viewpoint of all cells, share of pixels.
     pub error_max: f64,
     /// Refinement rounds of all cells.
@@ -187,6 +189,7 @@ impl Summary {
             out.refinements += u64::from(effort.refinements);
             out.segments += u64::from(effort.segments);
             out.solver_rays += effort.solver_rays;
+            out.skipped_movers += effort.skipped_movers;
             out.targets_met += u64::from(effort.target_met);
             error += effort.heldout_error_mean;
             out.error_upper = out.error_upper.max(effort.heldout_error_upper);
@@ -213,6 +216,7 @@ impl Summary {
             "targets_met": self.targets_met,
             "segments": self.segments,
             "solver_rays": self.solver_rays,
+            "skipped_movers": self.skipped_movers,
         })
     }
 
@@ -256,6 +260,10 @@ impl Summary {
             );
             let (met, all) = (thousands(self.targets_met), count(self.cells, "cell"));
             table.row("target met", format!("in {met} of {all}"));
+        }
+        if self.skipped_movers > 0 {
+            let times = thousands(self.skipped_movers);
+            table.row("hidden movers", format!("skipped {times} times, once a tile and state"));
         }
         table.row(
             "solved",

@@ -51,7 +51,7 @@ pub fn run(command: &Demo) -> Result<()> {
     let middle = opened.cells()[opened.cells().len() / 2].cell.clone();
     let row = runtime.block_on(opened.cell(middle.id))?;
     let exported = folder.join("cell.glb");
-    let report = export::write(&scene, &geometry, &row, &exported)?;
+    let report = export::write(&scene, &geometry, &row, None, &exported)?;
     print(&export::to_text(&report, &row, &geometry, &exported));
     print(&next_steps(folder, &out, &exported, middle.center()));
     Ok(())

@@ -293,12 +293,13 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
             "height": row.cell.height,
             "visible_primitives": row.set.len(),
             "states": states,
-            "runs": row.set.runs().len(),
+            "set_runs": row.set.runs().len(),
             "segments": effort.segments,
             "runs": effort.runs,
             "lines": effort.lines,
             "rows": effort.rows,
             "solver_rays": effort.solver_rays,
+            "skipped_movers": effort.skipped_movers,
             "refinements": effort.refinements,
             "heldout_viewpoints": effort.heldout_viewpoints,
             "heldout_rays": effort.heldout_rays,
@@ -339,6 +340,7 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
                 thousands(effort.solver_rays)
             ),
         )
+        .row("hidden movers", format!("skipped {} times", thousands(effort.skipped_movers)))
         .row("refinements", thousands(u64::from(effort.refinements)))
         .row(
             "pixel error",

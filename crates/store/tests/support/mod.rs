@@ -73,6 +73,7 @@ impl Sample {
         scene.particles = u64::from(last.end_primitive - last.first_primitive);
         for ((union, pairs), runs) in sample.cells.iter_mut().zip(&mut sample.runs) {
             union.last_state = 4;
+            union.effort.skipped_movers = 1000 * u64::from(union.cell.id.0);
             if union.cell.id.0.is_multiple_of(3) {
                 *runs = RUNS.iter().zip(0..).map(|(states, k)| part(union, states, k)).collect();
             }
@@ -207,6 +208,7 @@ fn cell(id: u32, objects: &[SceneObject], random: &mut Sequence) -> (CellRow, Ve
         lines: id % 5,
         rows: 64 << (id % 3),
         solver_rays: 1_000_000 + u64::from(id),
+        skipped_movers: 0,
         refinements: id % 3,
         heldout_viewpoints: 8192,
         heldout_rays: 64_000,
@@ -285,7 +287,16 @@ pub fn segments(count: u32) -> Vec<SegmentRow> {
         }
         let weights = (0..set.len()).map(|_| random.below(1 << 20) as f32 / 1e9).collect();
         let (segment, rays) = (SegmentId(3 * id), u64::from(1000 + id));
-        let whole = SegmentRow { segment, first_state: 0, last_state: 4, set, weights, rays };
+        let skipped_movers = 7 * u64::from(id);
+        let whole = SegmentRow {
+            segment,
+            first_state: 0,
+            last_state: 4,
+            set,
+            weights,
+            rays,
+            skipped_movers,
+        };
         if !id.is_multiple_of(4) {
             return vec![whole];
         }
@@ -293,6 +304,8 @@ pub fn segments(count: u32) -> Vec<SegmentRow> {
             first_state: 2,
             set: PrimitiveSet::default(),
             weights: vec![],
+            rays: 0,
+            skipped_movers: 0,
             ..whole.clone()
         };
         vec![SegmentRow { last_state: 1, ..whole }, nothing]
