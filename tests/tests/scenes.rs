@@ -29,6 +29,22 @@ const HOSPITAL: &str = "indoor/hospital_three_floors.glb";
 const HOSPITAL_INSTANCED: &str = "indoor/hospital_three_floors_gpuinst.glb";
 const QUAKE: &str = "indoor/lq_e1m1.glb";
 
+/// Scenes with animations, morph targets, skins, mirrored instances and sparse accessors.
+const ANIMATED: [&str; 12] = [
+    "animated/AnimatedMorphCube/glTF-Binary/AnimatedMorphCube.glb",
+    "animated/AnimatedMorphCube/glTF-Quantized/AnimatedMorphCube.gltf",
+    "animated/BoxAnimated/glTF-Binary/BoxAnimated.glb",
+    "animated/Fox/glTF-Binary/Fox.glb",
+    "animated/InterpolationTest/glTF-Binary/InterpolationTest.glb",
+    "animated/MeshPrimitiveModes/glTF/MeshPrimitiveModes.gltf",
+    "animated/NegativeScaleTest/glTF-Binary/NegativeScaleTest.glb",
+    "animated/RecursiveSkeletons/glTF-Binary/RecursiveSkeletons.glb",
+    "animated/SimpleInstancing/glTF-Binary/SimpleInstancing.glb",
+    "animated/SimpleMorph/glTF/SimpleMorph.gltf",
+    "animated/SimpleSkin/glTF/SimpleSkin.gltf",
+    "animated/SimpleSparseAccessor/glTF/SimpleSparseAccessor.gltf",
+];
+
 /// A room on the lowest floor, below its ceiling.
 const WARD: [&str; 4] =
     ["--region=-6,-2,0,2", "--cell-size=2", "--heights=absolute", "--eye-height=1.5,1.8"];
@@ -104,6 +120,44 @@ fn a_game_level_keeps_its_promise() {
     let Some(scene) = scenes::shared(test, QUAKE) else { return };
     let flags = ["--region=0,-5,10,0", "--cell-size=2.5", "--ground-from=6"];
     alone(|| assert_promise(&bake("quake", &scene, &flags), 8.0));
+}
+
+/// The middle of a scene's box, and the largest of its sides, metres.
+fn middle_and_size(scene: &Path) -> (DVec3, f64) {
+    let told = process::run(sightline(["info", "--json"]).arg(scene), LIMIT).success().json();
+    let corner = |name: &str| {
+        let at = &told["bounds"][name];
+        DVec3::new(number(&at[0]), number(&at[1]), number(&at[2]))
+    };
+    let (min, max) = (corner("min"), corner("max"));
+    (0.5 * (min + max), (max - min).max_element())
+}
+
+#[test]
+fn what_moves_keeps_its_promise_at_all_times() {
+    let test = "what_moves_keeps_its_promise_at_all_times";
+    for path in ANIMATED {
+        let Some(scene) = scenes::shared(test, path) else { return };
+        let (middle, size) = middle_and_size(&scene);
+        // Two cells: one that the scene is in, one beside it.
+        let region = [
+            middle.x - 0.25 * size,
+            middle.z - 0.25 * size,
+            middle.x + 0.75 * size,
+            middle.z + 0.25 * size,
+        ];
+        let [x0, z0, x1, z1] = region;
+        let height = |part: f64| middle.y + part * size;
+        let flags = [
+            format!("--region={x0},{z0},{x1},{z1}"),
+            format!("--cell-size={}", 0.5 * size),
+            "--heights=absolute".to_owned(),
+            format!("--eye-height={},{}", height(-0.05), height(0.05)),
+        ];
+        let flags = flags.each_ref().map(String::as_str);
+        let name = Path::new(path).file_stem().expect("a scene has a name").to_string_lossy();
+        alone(|| assert_promise(&bake(&name, &scene, &flags), 1.0));
+    }
 }
 
 /// A scene and the rows of its dataset.

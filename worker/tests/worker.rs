@@ -11,7 +11,7 @@ use glam::{DAffine3, DVec3};
 use prost::Message;
 use sightline_geometry::{
     Bounds, CellId, Instance, InstancedGeometry, Mesh, MeshId, ObjectId, ParticleSystem,
-    PrimitiveId, PrimitiveSet, SegmentId, Sphere, ViewCell,
+    PrimitiveId, PrimitiveSet, SegmentId, Sphere, Units, ViewCell,
 };
 use sightline_jobs::{BakeConfig, Plan, SceneRef, SkippedCells, TaskId, TiledCell, plan};
 use sightline_proto::encode_plan;

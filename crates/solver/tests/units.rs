@@ -159,7 +159,7 @@ proptest! {
 fn the_solver_stops_where_all_that_can_be_seen_has_been() {
     // A distant one that few rays meet, beside near ones that all do.
     let near = |x: f64, z: f64| (DVec3::new(x, 0.0, z), 6.0, DVec3::ZERO);
-    let far = (DVec3::new(80.0, 0.0, 60.0), 4.0, DVec3::ZERO);
+    let far = (DVec3::new(24.0, 0.0, 18.0), 4.0, DVec3::ZERO);
     let scene = sheets(&[near(4.0, 0.0), far, near(0.0, -4.0), near(-4.0, 0.0)], false);
     let units = Units::new(&scene, Granularity::Object);
     let solve = |units: Option<&Units>, exhaustive| {

@@ -33,10 +33,10 @@ impl Settled {
             set.push(Run { first: unit.start, end: unit.end });
         }
         // Over several runs, only what is in all of them is known; what is not costs time alone.
-        if let Some(known) = known.map(|known| known.within(states.clone())) {
-            if let [(_, known)] = known.runs() {
-                set = PrimitiveSet::union([&set, known]);
-            }
+        if let Some(known) = known.map(|known| known.within(states.clone()))
+            && let [(_, known)] = known.runs()
+        {
+            set = PrimitiveSet::union([&set, known]);
         }
         let has = |all: std::ops::Range<u32>| holds(&set, all);
         let movers = [&geometry.moving_occluders, &geometry.moving_see_through]
