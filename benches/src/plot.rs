@@ -104,6 +104,58 @@ pub fn draw(
     draw().map_err(|e| format!("{}: {e}", path.display()))
 }
 
+/// Draws lines through points, both axes linear and from 0.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn draw_lines(
+    path: &Path,
+    title: &str,
+    (x, y): (&str, &str),
+    lines: &[(&str, Vec<(f64, f64)>)],
+) -> Result<(), String> {
+    let points = || lines.iter().flat_map(|(_, points)| points);
+    let most = |of: fn(&(f64, f64)) -> f64| 1.05 * points().map(of).fold(0.0, f64::max);
+    let (width, height) = (most(|p| p.0), most(|p| p.1));
+    if width <= 0.0 || height <= 0.0 {
+        return Ok(());
+    }
+    let draw = || -> Result<(), Box<dyn std::error::Error>> {
+        let root = SVGBackend::new(path, SIZE).into_drawing_area();
+        root.fill(&WHITE)?;
+        let mut chart = ChartBuilder::on(&root)
+            .caption(title, ("sans-serif", 18))
+            .margin(12)
+            .x_label_area_size(42)
+            .y_label_area_size(70)
+            .build_cartesian_2d(0.0..width, 0.0..height)?;
+        chart
+            .configure_mesh()
+            .light_line_style(RGBColor(240, 240, 240))
+            .x_desc(x)
+            .y_desc(y)
+            .draw()?;
+        for (k, (name, points)) in lines.iter().enumerate() {
+            let color = COLORS[k % COLORS.len()];
+            let style = color.stroke_width(if k == 0 { 3 } else { 2 });
+            chart
+                .draw_series(LineSeries::new(points.iter().copied(), style))?
+                .label(*name)
+                .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
+            chart.draw_series(points.iter().map(|&at| Circle::new(at, 3, color.filled())))?;
+        }
+        chart
+            .configure_series_labels()
+            .background_style(WHITE.mix(0.85))
+            .border_style(RGBColor(200, 200, 200))
+            .position(SeriesLabelPosition::UpperLeft)
+            .draw()?;
+        root.present()?;
+        Ok(())
+    };
+    draw().map_err(|e| format!("{}: {e}", path.display()))
+}
+
 fn number(v: f64) -> String {
     if (1e-4..1e6).contains(&v) { format!("{v}") } else { format!("{v:e}") }
 }

@@ -15,9 +15,9 @@ use std::time::Instant;
 use clap::Parser;
 use glam::{DAffine3, DVec3};
 use sightline_benches::region::Place;
+use sightline_benches::walls::walls;
 use sightline_geometry::{
-    Bounds, Instance, InstancedGeometry, Mesh, MeshId, ObjectId, PrimitiveId, PrimitiveSet,
-    Sampling,
+    Bounds, Instance, InstancedGeometry, MeshId, ObjectId, PrimitiveId, PrimitiveSet, Sampling,
 };
 use sightline_quality::measure_viewpoint;
 use sightline_scene::{OpenOptions, Scene};
@@ -42,19 +42,6 @@ struct Arguments {
     /// Rounds over all numbers of bodies; the least time of each counts.
     #[arg(long, default_value_t = 9)]
     rounds: u32,
-}
-
-/// A closed box, seen from both sides.
-fn walls(bounds: Bounds) -> Mesh {
-    let corner = |k: usize| {
-        let side = |axis: usize| if k >> axis & 1 == 0 { bounds.min } else { bounds.max };
-        [0, 1, 2].map(|axis| side(axis)[axis] as f32)
-    };
-    let quads =
-        [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]];
-    let triangles: Vec<[u32; 3]> =
-        quads.iter().flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]]).collect();
-    Mesh::new((0..8).map(corner).collect(), &triangles).0
 }
 
 /// A scene in a box, and around the box as many copies of the scene as make `count` bodies. Nothing
