@@ -163,6 +163,36 @@ fn a_table_without_key_frames_rests() {
 }
 
 #[test]
+fn a_mover_whose_path_is_not_known_is_a_ball_that_holds_it() {
+    let csv = "state,particle,x,y,z,radius,max_speed\n\
+               0,3,0,0,0,0.5,2\n0,8,5,0,0,0.5,0\n1,8,5,0,0,0.5,0\n2,3,2,0,0,0.5,2\n3,8,5,0,0,0.5,0\n";
+    let scene = open("avatars.csv", csv).unwrap();
+    assert!(!scene.objects[0].occluder, "what is not all of the ball hides nothing");
+    let radius = |particle: u32, state: u32, t: f64| {
+        let found = spheres(&scene, Moment { state, t });
+        let shape = found.into_iter().find(|(id, _)| *id == particle).unwrap().1;
+        let Shape::Sphere { center, radius } = shape else { panic!("{particle} is there") };
+        (center.x, radius)
+    };
+    // Halfway between its rows it can be 2 m off, and chords are 0.5 m below that curve.
+    assert_eq!(radius(3, 1, 0.0), (1.0, 0.5 + 2.0 + 0.5));
+    assert_eq!(radius(3, 0, 0.0), (0.0, 0.5 + 0.5));
+    assert_eq!(radius(3, 2, 1.0).1, 0.5 + 2.0, "a second behind its last row");
+    assert_eq!(radius(8, 1, 0.5), (5.0, 0.5), "what cannot move does not");
+
+    let one = "particle,x,y,z,radius,max_acceleration\n1,0,0,0,1,5\n";
+    assert!(!open("one.csv", one).unwrap().objects[0].occluder);
+    let fast = "state,particle,x,y,z,radius,max_speed\n0,4,0,0,0,1,2\n1,4,9,0,0,1,2\n";
+    let TableProblem::TooFast { particle: 4, distance: 9.0, most: 2.0, .. } =
+        problem("a.csv", fast)
+    else {
+        panic!("it is refused")
+    };
+    let far = "state,particle,x,y,z,radius,max_speed,time\n0,4,0,0,0,1,1e9,0\n1,9,9,0,0,1,0,1e11\n";
+    assert!(matches!(problem("a.csv", far), TableProblem::Strays { particle: 4, .. }));
+}
+
+#[test]
 fn without_times_a_state_takes_a_second() {
     let csv = "particle,x,y,z,radius,state\n1,0,0,0,1,0\n1,1,0,0,1,1\n1,2,0,0,1,2\n";
     assert_eq!(open("a.csv", csv).unwrap().key_times, [0.0, 1.0, 2.0]);
@@ -320,6 +350,10 @@ fn refusals_name_the_row_the_column_and_what_to_do() {
         assert!(found.contains(message), "{rows}: {found}");
     }
     for (csv, message) in [
+        (
+            "particle,x,y,z,radius,max_speed\n1,0,0,0,1,-2\n",
+            "row 0 (line 2), column `max_speed`: -2",
+        ),
         (
             "particle,x,y,radius\n",
             "there is no column `z`; the columns are `particle`, `x`, `y`, `radius`",

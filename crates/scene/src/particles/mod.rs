@@ -15,11 +15,12 @@
 //! - nothing is kept for what the limit on spheres does not allow: particles times key frames are
 //!   counted before memory is reserved.
 //!
-//! Parts: `rows` parses; `key_times` brings tables and animations to the same key frames;
+//! Parts: `rows` parses; `reach` makes balls of rows that say how far a particle may stray; `key_times` brings tables and animations to the same key frames;
 //! `problem` says what is wrong; `table_writer` writes tables.
 
 mod key_times;
 mod problem;
+mod reach;
 mod rows;
 mod table_writer;
 
@@ -42,6 +43,7 @@ pub use table_writer::{TableWriter, WriteError};
 use crate::{
     Cause, IngestReport, Object, OpenOptions, Scene, SceneDigest, SceneError, gltf_reader,
 };
+use reach::Reach;
 use rows::{Row, Source};
 
 /// Node of the objects that particle tables make: they have none.
@@ -69,6 +71,8 @@ pub struct ParticleTable {
     pub keys: Vec<Vec<Sphere>>,
     /// The author's numbers of the particles, ascending.
     pub ids: Vec<u32>,
+    /// The most that is known of how each particle moves; empty where the rows are all that it does.
+    reaches: Vec<Reach>,
     size: u64,
     hash: blake3::Hash,
 }
@@ -91,9 +95,11 @@ fn read(path: &Path, source: &Source, max_spheres: u64) -> Result<ParticleTable,
     if survey.bounds.is_empty() {
         return Err(TableProblem::Empty.into());
     }
-    let Survey { numbers, key_times, bounds, .. } = survey;
-    let mut ids: Vec<u32> = numbers.into_keys().collect();
-    ids.sort_unstable();
+    let Survey { numbers, key_times, bounds, reaches, .. } = survey;
+    let mut by_id: Vec<(u32, u32)> = numbers.into_iter().collect();
+    by_id.sort_unstable();
+    let reaches = by_id.iter().filter_map(|(_, k)| reaches.get(*k as usize).copied()).collect();
+    let ids: Vec<u32> = by_id.into_iter().map(|(id, _)| id).collect();
     let mut filling = Filling {
         origin: bounds.center().round(),
         numbers: ids.iter().zip(0..).map(|(&id, number)| (id, number)).collect(),
@@ -105,7 +111,8 @@ fn read(path: &Path, source: &Source, max_spheres: u64) -> Result<ParticleTable,
         return Err(TableProblem::Changed.into());
     }
     let Filling { origin, keys, .. } = filling;
-    Ok(ParticleTable { path: path.to_path_buf(), origin, key_times, keys, ids, size, hash })
+    let path = path.to_path_buf();
+    Ok(ParticleTable { path, origin, key_times, keys, ids, reaches, size, hash })
 }
 
 /// What the first reading of a table finds.
@@ -114,6 +121,8 @@ struct Survey {
     numbers: HashMap<u32, u32>,
     /// The key frame at which a particle was seen last, by order of appearance.
     last_seen: Vec<u32>,
+    /// What the rows say of each, by order of appearance; empty where they say nothing.
+    reaches: Vec<Reach>,
     key_times: Vec<f64>,
     /// World box of all spheres at all key frames.
     bounds: Bounds,
@@ -125,6 +134,7 @@ impl Default for Survey {
         Self {
             numbers: HashMap::new(),
             last_seen: Vec::new(),
+            reaches: Vec::new(),
             key_times: Vec::new(),
             bounds: Bounds::EMPTY,
             limit: 0,
@@ -144,6 +154,12 @@ impl Survey {
             return Err(TableProblem::Twice { place, particle, state });
         }
         self.last_seen[number as usize] = row.state;
+        if let Some(reach) = row.reach {
+            match self.reaches.get_mut(number as usize) {
+                Some(before) => *before = before.or_looser(reach),
+                None => self.reaches.push(reach),
+            }
+        }
         let count = self.last_seen.len() as u64 * self.key_times.len() as u64;
         if count > self.limit {
             return Err(TableProblem::TooManySpheres { count, limit: self.limit });
@@ -268,8 +284,14 @@ impl Tables {
         let mut next = first_primitive;
         for (table, number) in self.tables.into_iter().zip(first_object..) {
             let name = table.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let occluder = !see_through.is_match(&name);
-            let keys = resample(&table.key_times, table.keys, key_times);
+            // A ball that holds a particle is not all particle.
+            let occluder = table.reaches.is_empty() && !see_through.is_match(&name);
+            let keys = if table.reaches.is_empty() {
+                resample(&table.key_times, table.keys, key_times)
+            } else {
+                balls(&table.key_times, table.keys, key_times, &table.reaches, &table.ids)
+                    .map_err(|problem| SceneError::from(problem).in_file(&table.path))?
+            };
             let id = ObjectId(number);
             let (system, order) =
                 ParticleSystem::new(id, PrimitiveId(next), occluder, table.origin, keys);
@@ -304,7 +326,8 @@ impl Tables {
         for table in &self.tables {
             let particles = table.ids.len() as u64;
             primitives += particles;
-            spheres += particles * if table.keys.len() > 1 { key_frames } else { 1 };
+            let rests = table.keys.len() == 1 && table.reaches.is_empty();
+            spheres += particles * if rests { 1 } else { key_frames };
         }
         let limit = self.max_spheres;
         if spheres > limit {
@@ -316,6 +339,37 @@ impl Tables {
         }
         Ok(())
     }
+}
+
+/// The balls that hold particles at the key frames of a scene, among which are those of their rows.
+fn balls(
+    times: &[f64],
+    rows: Vec<Vec<Sphere>>,
+    key_times: &[f64],
+    reaches: &[Reach],
+    ids: &[u32],
+) -> Result<Vec<Vec<Sphere>>, TableProblem> {
+    // Of a table with one key frame nothing is said about when; it holds from the start.
+    let times = if times.len() == 1 { &key_times[..1] } else { times };
+    let mut rows = times.iter().zip(rows).peekable();
+    let mut keys: Vec<Vec<Sphere>> = key_times
+        .iter()
+        .map(|time| {
+            let here = rows.next_if(|(own, _)| *own == time);
+            here.map_or_else(|| vec![Sphere::ABSENT; ids.len()], |(_, spheres)| spheres)
+        })
+        .collect();
+    if let Err(found) = reach::grow(&mut keys, key_times, reaches) {
+        let reach::TooFast { particle, from, distance, most } = found;
+        return Err(TableProblem::TooFast { particle: ids[particle], from, distance, most });
+    }
+    for (particle, sphere) in keys.iter().flat_map(|spheres| ids.iter().zip(spheres)) {
+        let radius = f64::from(sphere.radius);
+        if radius > gltf_reader::MAX_COORDINATE {
+            return Err(TableProblem::Strays { particle: *particle, radius });
+        }
+    }
+    Ok(keys)
 }
 
 /// Reads a scene of particles alone.

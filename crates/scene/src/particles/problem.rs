@@ -119,6 +119,29 @@ pub enum TableProblem {
         /// The limit.
         limit: u64,
     },
+    /// Two rows of a particle are farther apart than it can move between them.
+    #[error(
+        "particle {particle} moves {distance} m from {from} s on, and at its `max_speed` at most \
+         {most} m"
+    )]
+    TooFast {
+        /// The particle.
+        particle: u32,
+        /// Time of the earlier row, seconds.
+        from: f64,
+        /// Distance of the rows, metres.
+        distance: f64,
+        /// What `max_speed` allows, metres.
+        most: f64,
+    },
+    /// The ball that holds a particle is larger than a scene can be.
+    #[error("particle {particle} may be anywhere within {radius} m")]
+    Strays {
+        /// The particle.
+        particle: u32,
+        /// Radius of the ball, metres.
+        radius: f64,
+    },
     /// More key frames than a scene can have.
     #[error("the scene has {count} key frames or more; the limit is {limit}")]
     TooManyKeyFrames {
@@ -172,6 +195,10 @@ impl TableProblem {
                  key frames"
             }
             Self::TooManyKeyFrames { .. } => "use fewer key frames: motion between them is linear",
+            Self::Strays { .. } => {
+                "lower `max_speed` or `max_acceleration`, or give rows at shorter intervals"
+            }
+            Self::TooFast { .. } => "raise `max_speed`, or correct the rows or their times",
             Self::Changed => "wait until the file is written, and open the scene again",
         }
     }

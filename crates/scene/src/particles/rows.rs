@@ -28,6 +28,7 @@ use parquet::{
     file::reader::ChunkReader,
 };
 
+use super::reach::Reach;
 use super::{RowPlace, TableProblem};
 use crate::{
     Cause, SceneError,
@@ -39,8 +40,11 @@ const BATCH_ROWS: usize = 8192;
 /// Largest time of a key frame, seconds: differences of times stay finite and exact to a
 /// millisecond.
 const TIME_MAX: f64 = 1e12;
+/// Largest bound on a motion, metres a second, or a second squared: faster than light.
+const REACH_MAX: f64 = 1e9;
 
-const COLUMNS: [&str; 7] = ["particle", "x", "y", "z", "radius", "state", "time"];
+const COLUMNS: [&str; 9] =
+    ["particle", "x", "y", "z", "radius", "state", "time", "max_speed", "max_acceleration"];
 /// The first so many columns have to be there.
 const REQUIRED: usize = 5;
 const PARTICLE: usize = 0;
@@ -50,6 +54,11 @@ const Z: usize = 3;
 const RADIUS: usize = 4;
 const STATE: usize = 5;
 const TIME: usize = 6;
+const MAX_SPEED: usize = 7;
+const MAX_ACCELERATION: usize = 8;
+
+/// Where each of [`COLUMNS`] is in a file.
+type Places = [Option<usize>; COLUMNS.len()];
 
 const INTEGER_RULE: &str = "it has to be a whole number from 0 to 4294967295";
 const NUMBER_RULE: &str = "it has to be a number";
@@ -68,6 +77,8 @@ pub(super) struct Row {
     pub(super) center: DVec3,
     /// Metres.
     pub(super) radius: f64,
+    /// The most that is known of how it moves, in tables that say so.
+    pub(super) reach: Option<Reach>,
 }
 
 /// Formats of tables.
@@ -151,10 +162,8 @@ impl Source {
 type Each<'a> = &'a mut dyn FnMut(Row) -> Result<(), TableProblem>;
 
 /// Where each of [`COLUMNS`] is among the columns of a file.
-fn find_columns<'a>(
-    names: impl Iterator<Item = &'a str> + Clone,
-) -> Result<[Option<usize>; 7], TableProblem> {
-    let mut found = [None; 7];
+fn find_columns<'a>(names: impl Iterator<Item = &'a str> + Clone) -> Result<Places, TableProblem> {
+    let mut found: Places = Default::default();
     for (k, column) in COLUMNS.into_iter().enumerate() {
         let mut places = names.clone().enumerate().filter(|(_, name)| *name == column);
         found[k] = places.next().map(|(at, _)| at);
@@ -178,6 +187,7 @@ fn row(
     state: Option<u32>,
     [x, y, z, radius]: [f64; 4],
     time: Option<f64>,
+    reach: [Option<f64>; 2],
 ) -> Result<Row, TableProblem> {
     let refuse = |column: usize, value: f64, rule| {
         let column = COLUMNS[column];
@@ -198,8 +208,17 @@ fn row(
     if let Some(time) = time.filter(|time| time.is_nan() || time.abs() > TIME_MAX) {
         return refuse(TIME, time, "times lie within 1e12 seconds of 0");
     }
+    for (column, value) in [MAX_SPEED, MAX_ACCELERATION].into_iter().zip(reach) {
+        if let Some(value) = value.filter(|value| !(0.0..=REACH_MAX).contains(value)) {
+            return refuse(column, value, "the most that is known of a motion is from 0 to 1e9");
+        }
+    }
+    let reach = reach.iter().any(Option::is_some).then(|| {
+        let [speed, acceleration] = reach.map(|most| most.unwrap_or(f64::INFINITY));
+        Reach { speed, acceleration }
+    });
     let center = DVec3::new(x, y, z);
-    Ok(Row { place, particle, state: state.unwrap_or(0), time, center, radius })
+    Ok(Row { place, particle, state: state.unwrap_or(0), time, center, radius, reach })
 }
 
 fn csv_rows(reader: impl Read, each: Each<'_>) -> Result<(), SceneError> {
@@ -238,7 +257,7 @@ fn csv_rows(reader: impl Read, each: Each<'_>) -> Result<(), SceneError> {
 
 fn csv_row(
     record: &csv::ByteRecord,
-    columns: &[Option<usize>; 7],
+    columns: &Places,
     place: RowPlace,
 ) -> Result<Row, TableProblem> {
     fn parse<T: std::str::FromStr>(
@@ -265,7 +284,8 @@ fn csv_row(
     // Columns that have to be there are there.
     let required = |column: usize| Ok(number(column)?.unwrap_or(f64::NAN));
     let sphere = [required(X)?, required(Y)?, required(Z)?, required(RADIUS)?];
-    row(place, integer(PARTICLE)?.unwrap_or(0), integer(STATE)?, sphere, number(TIME)?)
+    let reach = [number(MAX_SPEED)?, number(MAX_ACCELERATION)?];
+    row(place, integer(PARTICLE)?.unwrap_or(0), integer(STATE)?, sphere, number(TIME)?, reach)
 }
 
 /// Runs the Parquet parser, which is not free of panics on damaged files; what a panic leaves behind is
@@ -337,7 +357,8 @@ fn batch_rows(batch: &RecordBatch, first: u64, each: Each<'_>) -> Result<(), Tab
     let numbers = |k: usize| column(k).map(|(_, array)| numbers(array));
     let (particle, state) = (integers(PARTICLE).unwrap_or_default(), integers(STATE));
     let [x, y, z, radius] = [X, Y, Z, RADIUS].map(|k| numbers(k).unwrap_or_default());
-    let time = numbers(TIME);
+    let [time, speed, acceleration] = [TIME, MAX_SPEED, MAX_ACCELERATION].map(numbers);
+    let at = |column: &Option<Vec<f64>>, row: usize| column.as_ref().map(|values| values[row]);
     for i in 0..batch.num_rows() {
         let place = place(i);
         let whole = |k: usize, value: i128| {
@@ -353,7 +374,8 @@ fn batch_rows(batch: &RecordBatch, first: u64, each: Each<'_>) -> Result<(), Tab
             whole(PARTICLE, particle[i])?,
             state.as_ref().map(|state| whole(STATE, state[i])).transpose()?,
             [x[i], y[i], z[i], radius[i]],
-            time.as_ref().map(|time| time[i]),
+            at(&time, i),
+            [at(&speed, i), at(&acceleration, i)],
         )?)?;
     }
     Ok(())
