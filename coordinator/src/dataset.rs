@@ -13,7 +13,7 @@ use sightline_store::{
 use crate::CoordinatorError;
 use crate::journal::Journal;
 
-/// Cells tasks whose parts are read ahead while the dataset is written.
+/// Tasks whose parts are read ahead while the dataset is written.
 const READ_AHEAD: usize = 4;
 
 /// The last step of a bake, behind a seam: tests of the protocol need no scene.
@@ -41,8 +41,8 @@ pub struct DatasetPublisher {
 impl Publish for DatasetPublisher {
     async fn publish(&self, journal: &Journal, plan: &Plan) -> Result<Published, CoordinatorError> {
         let store: &BakeStore = journal.store();
-        let mut writer = DatasetWriter::new(store, self.objects.clone())?;
-        let reads: Vec<_> = plan.cell_tasks().map(|task| read_rows(journal, plan, task)).collect();
+        let mut writer = DatasetWriter::new(store, self.objects.clone(), plan.timeline())?;
+        let reads: Vec<_> = plan.final_tasks().map(|task| read_rows(journal, plan, task)).collect();
         let mut parts = stream::iter(reads).buffered(READ_AHEAD);
         while let Some(rows) = parts.try_next().await? {
             for (cell, objects) in &rows {
@@ -61,10 +61,11 @@ impl Publish for DatasetPublisher {
     }
 }
 
-/// A cell and its (cell, object) rows.
-type CellRows = (CellRow, Vec<ObjectRow>);
+/// The rows of a cell: that of all states, those of its runs where it has several, and its (cell, object)
+/// rows.
+type CellRows = (Vec<CellRow>, Vec<ObjectRow>);
 
-/// The rows of a cells task, one entry a cell of the plan.
+/// The rows of a task at the end, one entry a cell of the plan.
 async fn read_rows(
     journal: &Journal,
     plan: &Plan,
@@ -84,18 +85,19 @@ async fn read_rows(
     };
     let rows = decode_cell_part(&cells.key, journal.part(cells).await?.into())?;
     let pairs = decode_object_part(&objects.key, journal.part(objects).await?.into())?;
+    let by_cell = rows.chunk_by(|a, b| a.cell.id == b.cell.id);
     let planned = plan.cells_of(task.id);
-    if !rows.iter().map(|row| &row.cell).eq(planned.iter().map(|cell| &cell.cell)) {
+    if !by_cell.clone().map(|own| &own[0].cell).eq(planned.iter().map(|cell| &cell.cell)) {
         return Err(journal.damaged(&cells.key, &"it does not hold the cells of its task"));
     }
     let mut pairs = pairs.into_iter().peekable();
-    let mut out = Vec::with_capacity(rows.len());
-    for row in rows {
+    let mut out = Vec::with_capacity(planned.len());
+    for rows in by_cell {
         let mut own = Vec::new();
-        while let Some(pair) = pairs.next_if(|pair| pair.cell == row.cell.id) {
+        while let Some(pair) = pairs.next_if(|pair| pair.cell == rows[0].cell.id) {
             own.push(pair);
         }
-        out.push((row, own));
+        out.push((rows.to_vec(), own));
     }
     if pairs.next().is_some() {
         return Err(journal.damaged(&objects.key, &"it holds rows of cells of other tasks"));

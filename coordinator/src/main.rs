@@ -49,7 +49,7 @@ async fn main() -> ExitCode {
             tracing::info!(
                 manifest = summary.manifest,
                 changed = summary.changed,
-                cells = summary.status.cells.total,
+                cells = summary.status.dataset_cells(),
                 solve_ms = summary.status.solve_ms,
                 merge_ms = summary.status.merge_ms,
                 "done"

@@ -59,16 +59,22 @@ fn describe(skipped: &SkippedCells) -> String {
 /// When the configuration, the scene or the region is refused.
 pub fn prepare(path: &Path, config: BakeConfig) -> Result<Prepared, PrepareError> {
     config.validate()?;
-    let scene = Scene::open(path, &open_options(&config))?;
+    let scene = Scene::open(path, &open_options(path, &config))?;
     prepare_scene(Arc::new(scene), path, config)
 }
 
-/// How a scene has to be opened for a bake with this configuration: workers do the same.
+/// How the scene at `path` has to be opened for a bake with this configuration: workers do the same.
+/// Tables of particles lie relative to it.
 #[must_use]
-pub fn open_options(config: &BakeConfig) -> OpenOptions {
-    let mut options = OpenOptions::default();
-    options.see_through.clone_from(&config.scene.see_through);
-    options
+pub fn open_options(path: &Path, config: &BakeConfig) -> OpenOptions {
+    let scene = &config.scene;
+    OpenOptions::of_bake(
+        path,
+        &scene.see_through,
+        &scene.particles,
+        scene.animation.as_deref(),
+        scene.motion_error,
+    )
 }
 
 /// As [`prepare`], with a scene that was opened with [`open_options`].
@@ -91,9 +97,9 @@ pub fn prepare_scene(
     let publisher = DatasetPublisher {
         objects: objects(&scene),
         numbering: numbering(&scene),
-        source: source(&reference),
+        source: source(&reference, &scene),
     };
-    let plan = plan(reference, config, cells, skipped);
+    let plan = plan(reference, config, scene.key_times.clone(), cells, skipped);
     tracing::info!(
         cells = plan.cells.len(),
         segments = plan.segments.len(),
@@ -134,7 +140,8 @@ fn scene_ref(scene: &Scene, path: &Path) -> SceneRef {
     }
 }
 
-fn source(scene: &SceneRef) -> SceneSource {
+fn source(scene: &SceneRef, read: &Scene) -> SceneSource {
+    let geometry = &read.geometry;
     let file = |f: &SceneFile| StoredFile {
         name: f.path.clone(),
         bytes: f.bytes,
@@ -144,7 +151,9 @@ fn source(scene: &SceneRef) -> SceneSource {
         uri: scene.name.clone(),
         hash: scene.digest.clone(),
         files: scene.files.iter().map(file).collect(),
-        // Numbers are filled in from the objects.
+        particles: u64::from(geometry.primitive_count() - geometry.triangle_count()),
+        particle_systems: geometry.particles.len() as u64,
+        // The other numbers are filled in from the objects.
         ..SceneSource::default()
     }
 }

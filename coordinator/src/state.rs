@@ -212,10 +212,10 @@ impl State {
             if self.phase == phase { now_ms.saturating_sub(self.phase_since_ms) } else { 0 }
         };
         let solve_ms = self.solve_ms + in_phase(Phase::Solving);
-        let cells = self.done(|kind| matches!(kind, TaskKind::Cells { .. }), self.plan.cells.len());
-        let segments =
-            self.done(|kind| matches!(kind, TaskKind::Segments { .. }), self.plan.segments.len());
-        let units = (cells.done + segments.done).saturating_sub(self.units_resumed);
+        let cells = self.done(|kind| matches!(kind, TaskKind::Cells { .. }));
+        let segments = self.done(|kind| matches!(kind, TaskKind::Segments { .. }));
+        let joins = self.done(|kind| matches!(kind, TaskKind::Join { .. }));
+        let units = (cells.done + segments.done + joins.done).saturating_sub(self.units_resumed);
         BakeStatus {
             bake_id: self.plan.bake_id.clone(),
             epoch: self.epoch,
@@ -223,6 +223,7 @@ impl State {
             tasks: self.scheduler.progress(),
             cells,
             segments,
+            joins,
             tasks_resumed: self.tasks_resumed,
             workers: self.worker_statuses(),
             quarantined: missing
@@ -248,9 +249,10 @@ impl State {
         }
     }
 
-    fn done(&self, counts: impl Fn(&TaskKind) -> bool, total: usize) -> Done {
+    fn done(&self, counts: impl Fn(&TaskKind) -> bool) -> Done {
         let done = self.scheduler.units_committed(|task| counts(&self.plan.task(task).kind));
-        Done { done, total: total as u64 }
+        let kinds = self.plan.tasks.iter().map(|task| &task.kind).filter(|kind| counts(kind));
+        Done { done, total: kinds.map(|kind| u64::from(kind.units())).sum() }
     }
 
     fn worker_statuses(&self) -> Vec<WorkerStatus> {

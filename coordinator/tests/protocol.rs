@@ -40,11 +40,17 @@ impl Publish for CountCommits {
 
 /// A row of flat cells: 3 n + 1 segments a ring.
 fn sample_plan(cells: u32) -> Plan {
+    moving_plan(cells, vec![0.0])
+}
+
+/// The same in a scene with key frames at these times; two states a task.
+fn moving_plan(cells: u32, key_times: Vec<f64>) -> Plan {
     let mut config = BakeConfig::default();
     config.region.rectangles = vec![[0.0, 0.0, 10.0, 10.0]];
     config.solver.rings = 1;
     config.tasks.segments_per_task = 4;
     config.tasks.cells_per_task = 2;
+    config.tasks.states_per_task = 2;
     let scene = SceneRef {
         uri: "city.glb".into(),
         name: "city.glb".into(),
@@ -62,7 +68,7 @@ fn sample_plan(cells: u32) -> Plan {
             tile: [i32::try_from(k).unwrap(), 0],
         }
     };
-    plan(scene, config, (0..cells).map(cell).collect(), SkippedCells::default())
+    plan(scene, config, key_times, (0..cells).map(cell).collect(), SkippedCells::default())
 }
 
 fn options(store: &BakeStore, plan: &Plan) -> CoordinatorOptions {
@@ -173,6 +179,20 @@ fn committed() -> v1::report_request::Result {
 fn failed(class: v1::FailureClass) -> v1::report_request::Result {
     let reason = "it broke".to_owned();
     v1::report_request::Result::Failed(v1::Failed { class: class.into(), reason })
+}
+
+#[tokio::test]
+async fn ranges_of_states_are_solved_and_then_joined() {
+    let store = BakeStore::in_memory();
+    let plan = moving_plan(9, vec![0.0, 1.0, 2.0, 4.0, 5.0, 7.0]);
+    let coordinator = start(&store, &plan).await;
+    let mut worker = FakeWorker::join(&coordinator, &store).await;
+    let done = worker.work().await;
+    let wanted: Vec<u32> = (0..u32::try_from(plan.tasks.len()).unwrap()).collect();
+    assert_eq!(done, wanted, "one worker takes them in their order");
+    let status = coordinator.join().await.unwrap().status;
+    assert_eq!((status.cells.done, status.segments.done), (3 * 9, 3 * 28));
+    assert_eq!((status.joins.done, status.joins.total, status.dataset_cells()), (9, 9, 9));
 }
 
 #[tokio::test]

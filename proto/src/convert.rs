@@ -5,8 +5,8 @@ use prost::Message;
 use sightline_geometry::{CellId, SegmentId, ViewCell, ViewSegment};
 use sightline_jobs::{
     BakeConfig, BakeStatus, ConfigError, Done, FORMAT_VERSION, FailureClass, Phase, Plan,
-    PlannedCell, Progress, QuarantinedTask, SceneFile, SceneRef, SkippedCells, Task, TaskId,
-    TaskKind, WorkerStatus,
+    PlannedCell, Progress, QuarantinedTask, SceneFile, SceneRef, SkippedCells, StateRange, Task,
+    TaskId, TaskKind, WorkerStatus,
 };
 
 use crate::v1;
@@ -157,24 +157,38 @@ fn segment(id: u32, message: v1::Segment) -> Result<ViewSegment, ConvertError> {
 
 impl From<&Task> for v1::Task {
     fn from(task: &Task) -> Self {
-        let kind = match task.kind {
-            TaskKind::Segments { first, end } => {
-                v1::task::Kind::Segments(v1::Range { first: first.0, end: end.0 })
+        use v1::task::Kind;
+        let range = |first: u32, end: u32| v1::Range { first, end };
+        let in_states = |states: StateRange| Some(range(states.first, states.end));
+        let (kind, states) = match task.kind {
+            TaskKind::Segments { first, end, states } => {
+                (Kind::Segments(range(first.0, end.0)), in_states(states))
             }
-            TaskKind::Cells { first, end } => {
-                v1::task::Kind::Cells(v1::Range { first: first.0, end: end.0 })
+            TaskKind::Cells { first, end, states } => {
+                (Kind::Cells(range(first.0, end.0)), in_states(states))
             }
+            TaskKind::Join { first, end } => (Kind::Join(range(first.0, end.0)), None),
         };
-        Self { kind: Some(kind), depends_on: task.depends_on.iter().map(|d| d.0).collect() }
+        Self { kind: Some(kind), depends_on: task.depends_on.iter().map(|d| d.0).collect(), states }
     }
 }
 
 fn task(id: u32, message: v1::Task) -> Result<Task, ConvertError> {
+    use v1::task::Kind;
+    let states = || {
+        let states = message.states.ok_or(missing("Task", "states"))?;
+        Ok::<_, ConvertError>(StateRange { first: states.first, end: states.end })
+    };
     let kind = match message.kind.ok_or(missing("Task", "kind"))? {
-        v1::task::Kind::Segments(r) => {
-            TaskKind::Segments { first: SegmentId(r.first), end: SegmentId(r.end) }
+        Kind::Segments(r) => TaskKind::Segments {
+            first: SegmentId(r.first),
+            end: SegmentId(r.end),
+            states: states()?,
+        },
+        Kind::Cells(r) => {
+            TaskKind::Cells { first: CellId(r.first), end: CellId(r.end), states: states()? }
         }
-        v1::task::Kind::Cells(r) => TaskKind::Cells { first: CellId(r.first), end: CellId(r.end) },
+        Kind::Join(r) => TaskKind::Join { first: CellId(r.first), end: CellId(r.end) },
     };
     let depends_on = message.depends_on.into_iter().map(TaskId).collect();
     Ok(Task { id: TaskId(id), kind, depends_on })
@@ -193,6 +207,7 @@ impl From<&Plan> for v1::Plan {
             segments: plan.segments.iter().map(segment).collect(),
             tasks: plan.tasks.iter().map(Into::into).collect(),
             skipped: plan.skipped.0.clone(),
+            key_times: plan.key_times.clone(),
         }
     }
 }
@@ -221,6 +236,7 @@ impl TryFrom<v1::Plan> for Plan {
                 .zip(message.tasks)
                 .map(|(id, m)| task(id, m))
                 .collect::<Result<_, _>>()?,
+            key_times: message.key_times,
             skipped: SkippedCells(message.skipped),
         };
         plan.check().map_err(|problem| invalid("Plan", "tasks", problem))?;
@@ -334,6 +350,7 @@ impl From<&BakeStatus> for v1::Status {
             tasks: Some(s.tasks.into()),
             cells: Some(s.cells.into()),
             segments: Some(s.segments.into()),
+            joins: Some(s.joins.into()),
             tasks_resumed: s.tasks_resumed,
             workers: s.workers.iter().map(worker).collect(),
             quarantined: s.quarantined.iter().map(quarantined).collect(),
@@ -370,6 +387,7 @@ impl TryFrom<v1::Status> for BakeStatus {
             tasks: m.tasks.ok_or(missing("Status", "tasks"))?.into(),
             cells: m.cells.ok_or(missing("Status", "cells"))?.into(),
             segments: m.segments.ok_or(missing("Status", "segments"))?.into(),
+            joins: m.joins.ok_or(missing("Status", "joins"))?.into(),
             tasks_resumed: m.tasks_resumed,
             workers: m.workers.into_iter().map(worker).collect(),
             quarantined: m.quarantined.into_iter().map(quarantined).collect(),
@@ -393,10 +411,15 @@ mod tests {
     use super::*;
 
     fn sample(count: u32, size: f64) -> Plan {
+        moving(count, size, vec![0.0])
+    }
+
+    fn moving(count: u32, size: f64, key_times: Vec<f64>) -> Plan {
         let mut config = BakeConfig::default();
         config.region.rectangles = vec![[0.0, 0.0, size, 10.0]];
         config.region.ground_from = Some(size);
         config.tasks.segments_per_task = 3;
+        config.tasks.states_per_task = 2;
         let scene = SceneRef {
             uri: "data/city.gltf".into(),
             name: "city.gltf".into(),
@@ -422,13 +445,16 @@ mod tests {
                 }
             })
             .collect();
-        plan(scene, config, cells, SkippedCells([("no ground".into(), 4)].into()))
+        plan(scene, config, key_times, cells, SkippedCells([("no ground".into(), 4)].into()))
     }
 
     proptest! {
         #[test]
-        fn plans_survive_the_round_trip_to_the_bit(count in 0..9u32, size in 0.001..1e6f64) {
-            let plan = sample(count, size);
+        fn plans_survive_the_round_trip_to_the_bit(
+            count in 0..9u32, size in 0.001..1e6f64, frames in 1..8u32, last in 0.0..1e9f64,
+        ) {
+            let times = (0..frames).map(|k| last + 0.1 * f64::from(k)).collect();
+            let plan = moving(count, size, times);
             let bytes = encode_plan(&plan);
             let back = decode_plan(&bytes).unwrap();
             prop_assert_eq!(&back, &plan);
@@ -457,6 +483,8 @@ mod tests {
         };
         assert_eq!(error(|m| m.scene = None), "a Plan has no `scene`");
         assert_eq!(error(|m| m.tasks[0].kind = None), "a Task has no `kind`");
+        assert_eq!(error(|m| m.tasks[0].states = None), "a Task has no `states`");
+        assert!(error(|m| m.key_times.clear()).contains("key frame"));
         assert_eq!(error(|m| m.segments[0].v1 = None), "a Segment has no `v1`");
         assert!(error(|m| m.format_version = 99).contains("99"));
         assert!(error(|m| m.cells[0].corners.truncate(3)).contains("3 instead of 4"));
@@ -480,6 +508,7 @@ mod tests {
             },
             cells: Done { done: 1, total: 4 },
             segments: Done { done: 2, total: 8 },
+            joins: Done { done: 0, total: 3 },
             tasks_resumed: 1,
             workers: vec![WorkerStatus {
                 id: 1,

@@ -5,29 +5,31 @@
 //! nothing is changed or deleted: the task is done (JB-1).
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use prost::Message;
-use sightline_geometry::SegmentId;
+use sightline_geometry::{SegmentId, Timeline};
 use sightline_jobs::{Plan, TaskId, TaskKind};
 use sightline_proto::v1;
 use sightline_scene::Scene;
 use sightline_store::{
-    BakeStore, Created, PartKind, SegmentRow, decode_segment_part_where, encode_cell_part,
-    encode_object_part, encode_segment_part, keys,
+    BakeStore, CellRow, Created, PartKind, SegmentRow, decode_cell_part, decode_segment_part_where,
+    encode_cell_part, encode_object_part, encode_segment_part, keys,
 };
 
 use crate::cache::PartCache;
 use crate::error::AttemptError;
 use crate::pool::{Cancel, SolvePool};
-use crate::solve::{self, CellOutput};
+use crate::solve::{self, CellOutput, Work};
 
 /// What all attempts at the tasks of one bake share.
 pub(crate) struct Bake {
     pub store: BakeStore,
     pub plan: Plan,
+    timeline: Timeline,
     pub scene: Arc<Scene>,
     pub pool: SolvePool,
     cache: Mutex<PartCache>,
@@ -36,9 +38,20 @@ pub(crate) struct Bake {
 /// A part that is ready to be written.
 type Part = (PartKind, Bytes);
 
+/// What a task reads of those that it depends on.
+enum Inputs {
+    /// A segments task reads nothing.
+    Nothing,
+    /// The rows of the cells' segments in the states of a cells task.
+    Segments(BTreeMap<SegmentId, Vec<SegmentRow>>),
+    /// Range by range of states, the rows of the cells of a join task.
+    Ranges(Vec<Vec<CellRow>>),
+}
+
 impl Bake {
     pub fn new(store: BakeStore, plan: Plan, scene: Arc<Scene>, pool: SolvePool) -> Self {
-        Self { store, plan, scene, pool, cache: Mutex::default() }
+        let timeline = plan.timeline();
+        Self { store, plan, timeline, scene, pool, cache: Mutex::default() }
     }
 
     /// Attempts a task; on success its commit exists. Gives the time spent in computing.
@@ -48,14 +61,15 @@ impl Bake {
         attempt: &str,
         cancel: &Cancel,
     ) -> Result<Duration, AttemptError> {
-        let rows = match self.plan.task(task).kind {
-            TaskKind::Segments { .. } => BTreeMap::new(),
-            TaskKind::Cells { .. } => self.read_dependencies(task).await?,
+        let inputs = match self.plan.task(task).kind {
+            TaskKind::Segments { .. } => Inputs::Nothing,
+            TaskKind::Cells { .. } => Inputs::Segments(self.read_segments(task).await?),
+            TaskKind::Join { .. } => Inputs::Ranges(self.read_ranges(task).await?),
         };
         let (bake, cancelled) = (Arc::clone(self), cancel.clone());
         let compute = move || {
             let start = Instant::now();
-            let parts = bake.compute(task, &rows, &cancelled)?;
+            let parts = bake.compute(task, &inputs, &cancelled)?;
             Ok::<_, AttemptError>((parts, start.elapsed()))
         };
         let (parts, solve_time) = self.pool.run(compute).await??;
@@ -70,30 +84,33 @@ impl Bake {
     fn compute(
         &self,
         task: TaskId,
-        rows: &BTreeMap<SegmentId, SegmentRow>,
+        inputs: &Inputs,
         cancel: &Cancel,
     ) -> Result<Vec<Part>, AttemptError> {
-        let Self { plan, scene, .. } = self;
-        match plan.task(task).kind {
-            TaskKind::Segments { .. } => {
+        let Self { plan, scene, timeline, .. } = self;
+        let states = plan.states_of(task);
+        let work = Work { scene, timeline, config: &plan.config, states };
+        let solved = match inputs {
+            Inputs::Nothing => {
                 let segments = plan.segments_of(task);
-                let solved = solve::solve_segments(scene, segments, &plan.config, cancel)
-                    .ok_or(AttemptError::GivenUp)?;
-                Ok(vec![(PartKind::Segments, encode_segment_part(&solved)?)])
-            }
-            TaskKind::Cells { .. } => {
-                let cells = plan.cells_of(task);
                 let solved =
-                    solve::solve_cells(scene, cells, &plan.segments, rows, &plan.config, cancel)
-                        .ok_or(AttemptError::GivenUp)?;
-                let (cells, objects): (Vec<_>, Vec<_>) =
-                    solved.into_iter().map(|CellOutput { cell, objects }| (cell, objects)).unzip();
-                Ok(vec![
-                    (PartKind::Cells, encode_cell_part(&cells)?),
-                    (PartKind::Objects, encode_object_part(&objects.concat())?),
-                ])
+                    solve::solve_segments(&work, segments, cancel).ok_or(AttemptError::GivenUp)?;
+                return Ok(vec![(PartKind::Segments, encode_segment_part(&solved)?)]);
             }
+            Inputs::Segments(rows) => {
+                let cells = plan.cells_of(task);
+                solve::solve_cells(&work, cells, &plan.segments, rows, cancel)
+                    .ok_or(AttemptError::GivenUp)?
+            }
+            Inputs::Ranges(ranges) => solve::join_cells(scene, timeline, ranges),
+        };
+        let (cells, objects): (Vec<_>, Vec<_>) =
+            solved.into_iter().map(|CellOutput { rows, objects }| (rows, objects)).unzip();
+        let mut parts = vec![(PartKind::Cells, encode_cell_part(&cells.concat())?)];
+        if work.takes_all_states() {
+            parts.push((PartKind::Objects, encode_object_part(&objects.concat())?));
         }
+        Ok(parts)
     }
 
     /// Steps 1 and 2 of an attempt: the parts, then the commit.
@@ -128,36 +145,76 @@ impl Bake {
         Ok(())
     }
 
-    /// The rows of all segments of a cells task's cells.
-    async fn read_dependencies(
+    /// The rows of all segments of a cells task's cells, in its states.
+    async fn read_segments(
         &self,
         task: TaskId,
-    ) -> Result<BTreeMap<SegmentId, SegmentRow>, AttemptError> {
+    ) -> Result<BTreeMap<SegmentId, Vec<SegmentRow>>, AttemptError> {
         let wanted: BTreeSet<SegmentId> =
             self.plan.cells_of(task).iter().flat_map(|cell| cell.segments.clone()).collect();
-        let mut rows = BTreeMap::new();
+        let mut rows: BTreeMap<SegmentId, Vec<SegmentRow>> = BTreeMap::new();
         for dependency in &self.plan.task(task).depends_on {
-            let (key, part) = self.segment_part(*dependency).await?;
-            let decoded = decode_segment_part_where(&key, part, |id| wanted.contains(&id))?;
-            rows.extend(decoded.into_iter().map(|row| (row.segment, row)));
+            let (key, part) = self.committed_part(*dependency, PartKind::Segments).await?;
+            for row in decode_segment_part_where(&key, part, |id| wanted.contains(&id))? {
+                rows.entry(row.segment).or_default().push(row);
+            }
         }
-        match wanted.iter().find(|id| !rows.contains_key(id)) {
+        let states = self.plan.states_of(task);
+        let whole = |id: &SegmentId| {
+            rows.get(id).is_some_and(|own| follow(own.iter().map(SegmentRow::states), &states))
+        };
+        match wanted.iter().find(|id| !whole(id)) {
             None => Ok(rows),
-            Some(id) => Err(AttemptError::Input {
-                key: keys::commit(&self.plan.bake_id, self.plan.task_of_segment(*id).0),
-                problem: format!("its part does not hold segment {id}"),
-            }),
+            Some(id) => {
+                let holder = self.plan.task_of_segment(*id, states.start);
+                Err(AttemptError::Input {
+                    key: keys::commit(&self.plan.bake_id, holder.0),
+                    problem: format!(
+                        "its part does not hold segment {id} in its states, once each"
+                    ),
+                })
+            }
         }
     }
 
-    /// The committed part of a segments task, checked against its commit.
-    async fn segment_part(&self, task: TaskId) -> Result<(String, Bytes), AttemptError> {
-        let commit_key = keys::commit(&self.plan.bake_id, task.0);
+    /// The rows of a join task's cells, range by range of states.
+    async fn read_ranges(&self, task: TaskId) -> Result<Vec<Vec<CellRow>>, AttemptError> {
+        let planned = self.plan.cells_of(task);
+        let mut ranges = Vec::new();
+        for dependency in &self.plan.task(task).depends_on {
+            let (key, part) = self.committed_part(*dependency, PartKind::Cells).await?;
+            let mut rows = decode_cell_part(&key, part)?;
+            rows.sort_by_key(|row| (row.cell.id, row.first_state));
+            let states = self.plan.states_of(*dependency);
+            let by_cell: Vec<&[CellRow]> = rows.chunk_by(|a, b| a.cell.id == b.cell.id).collect();
+            let is_whole = by_cell.len() == planned.len()
+                && by_cell.iter().zip(planned).all(|(own, planned)| {
+                    own.iter().all(|row| row.cell == planned.cell)
+                        && follow(own.iter().map(CellRow::states), &states)
+                });
+            if !is_whole {
+                let problem = "it does not hold the cells of its task in its states, once each";
+                return Err(AttemptError::Input { key, problem: problem.into() });
+            }
+            ranges.push(rows);
+        }
+        Ok(ranges)
+    }
+
+    /// A committed part of a task, checked against its commit.
+    async fn committed_part(
+        &self,
+        task: TaskId,
+        kind: PartKind,
+    ) -> Result<(String, Bytes), AttemptError> {
+        let bake_id = &self.plan.bake_id;
+        let commit_key = keys::commit(bake_id, task.0);
         let damaged = |problem: String| AttemptError::Input { key: commit_key.clone(), problem };
         let commit = v1::Commit::decode(self.store.get(&commit_key).await?)
             .map_err(|error| damaged(error.to_string()))?;
-        let [part] = &commit.parts[..] else {
-            return Err(damaged(format!("it names {} parts instead of 1", commit.parts.len())));
+        let wanted = keys::part(bake_id, task.0, &commit.attempt, kind);
+        let Some(part) = commit.parts.iter().find(|part| part.key == wanted) else {
+            return Err(damaged(format!("it does not name `{wanted}`")));
         };
         if let Some(bytes) = self.cache().get(&part.digest) {
             return Ok((part.key.clone(), bytes));
@@ -167,7 +224,10 @@ impl Bake {
             let problem = "it does not hold the bytes that were committed".into();
             return Err(AttemptError::Input { key: part.key.clone(), problem });
         }
-        self.cache().put(&part.digest, bytes.clone());
+        // Neighbouring cells tasks read the same segments; what a join reads is read once.
+        if kind == PartKind::Segments {
+            self.cache().put(&part.digest, bytes.clone());
+        }
         Ok((part.key.clone(), bytes))
     }
 
@@ -175,4 +235,13 @@ impl Bake {
         // A panic while the cache is held leaves at worst a part too few in it.
         self.cache.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// True when ranges follow each other and take each of `states` once.
+fn follow(ranges: impl Iterator<Item = Range<u32>>, states: &Range<u32>) -> bool {
+    let mut next = Some(states.start);
+    for range in ranges {
+        next = next.filter(|next| *next == range.start).map(|_| range.end);
+    }
+    next == Some(states.end)
 }

@@ -20,22 +20,34 @@
 //!
 //! Easy cells stop after the first measurement. docs/adr/0008 has the reasons.
 //!
-//! Everything is seeded by the cell's number and the round, so the row is a function of scene and
-//! configuration alone.
+//! Where something moves, all of this is done at once for the states of the task, with a set a state.
+//! Rays are cast at random moments. What is added is solved in the states from the first to the last in
+//! which a ray was wrong: what is missing beside them has not been seen, but it is most likely the same.
+//! Camera and time are coupled otherwise than before: the first run reverses what the plan has on each
+//! edge; those that follow stop the clock at 1/2, then at 1/4 and 3/4, and so on, of the stops of one
+//! spacing first at the one that most wrong rays are near to. Lines stop it when their suspect was wrong,
+//! so that they see what it should have seen.
+//!
+//! Everything is seeded by the cell's number, the first state and the round, so the rows are a function
+//! of scene, configuration and the states that are taken together.
+
+use std::ops::Range;
 
 use glam::DVec3;
 use rayon::prelude::*;
 use sightline_geometry::{
-    PrimitiveSet, Sampling, SegmentId, ViewCell, ViewSegment, overlap::primitives_in_cell,
+    Sampling, SegmentId, StateSets, ViewCell, ViewSegment, overlap::primitives_in_cell_over,
 };
-use sightline_jobs::{BakeConfig, PlannedCell};
+use sightline_jobs::PlannedCell;
 use sightline_quality::{
-    ErrorTest, Members, SCATTERED_BATCH, Verdict, measure_scattered, measure_viewpoints,
+    ErrorTest, SCATTERED_BATCH, StateMembers, Suspect, Verdict, measure_scattered_over,
+    measure_viewpoints_at,
 };
-use sightline_scene::Scene;
+use sightline_solver::TimePath;
 use sightline_store::{CellEffort, CellRow, SegmentRow};
 
-use crate::solve::{CellOutput, solve_segment};
+use crate::join::join_cell;
+use crate::solve::{CellOutput, Work, planned_path, sets_of, solve_segment};
 use crate::weights::{CellWeights, Seen, object_rows};
 
 /// Base of the seeds of held-out viewpoints ("sightline" on a keypad); the round is added. Far
@@ -44,6 +56,9 @@ const HELDOUT_SEED: u64 = 744_485_463_000_000;
 
 /// Base of the seeds of suspects' rays.
 const SUSPECT_SEED: u64 = HELDOUT_SEED + 1_000_000;
+
+/// Seeds of a range of states start so far apart, times its first state.
+const STATE_SEEDS: u64 = 10_000_000;
 
 /// Suspects that are measured in a round: enough to tell pockets from an error that is spread thin.
 const SUSPECTS_MAX: usize = 8;
@@ -73,16 +88,21 @@ const EXTRA_MAX: u32 = 1 << 10;
 /// A segment that was solved for the cell alone.
 struct Extra {
     segment: ViewSegment,
-    row: SegmentRow,
+    /// By runs of the states in which it was solved.
+    rows: Vec<SegmentRow>,
 }
 
 /// What one measurement found.
 struct Finding {
     test: ErrorTest,
-    /// Viewpoints of wrong rays that were measured in full, and their errors.
-    suspects: Vec<(DVec3, f64)>,
+    /// Viewpoints and moments of wrong rays that were measured in full, and their errors.
+    suspects: Vec<(Suspect, f64)>,
     /// Relative heights of the viewpoints of all wrong rays.
     heights: Vec<f64>,
+    /// When they were wrong: t of their states.
+    times: Vec<f64>,
+    /// From the first to the last state in which a ray was wrong; all where none was.
+    states: Range<u32>,
 }
 
 impl Finding {
@@ -91,12 +111,12 @@ impl Finding {
     }
 }
 
-/// A cell's visible set while it grows.
+/// A cell's visible sets while they grow.
 struct Sight<'a> {
-    scene: &'a Scene,
-    config: &'a BakeConfig,
+    work: &'a Work<'a>,
+    planned: &'a PlannedCell,
     cell: &'a ViewCell,
-    set: PrimitiveSet,
+    sets: StateSets,
     extra: Vec<Extra>,
     runs: u32,
     lines: u32,
@@ -104,6 +124,8 @@ struct Sight<'a> {
     rows: u32,
     /// Runs at the bottom, the middle and the top of the cell.
     runs_at: [u32; 3],
+    /// Where the clock was stopped for runs.
+    stops: Vec<f64>,
     /// The mean error before the last round's run, when it made one.
     before_run: Option<f64>,
     solver_rays: u64,
@@ -111,46 +133,64 @@ struct Sight<'a> {
 }
 
 impl Sight<'_> {
+    fn seed(&self, base: u64, round: u32) -> u64 {
+        base + u64::from(round) + STATE_SEEDS * u64::from(self.work.states.start)
+    }
+
     fn measure(&mut self, round: u32) -> Finding {
-        let Self { scene, cell, config, .. } = *self;
+        let Self { work, cell, .. } = *self;
+        let Work { scene, timeline, config, .. } = work;
         let geometry = &scene.geometry;
-        let members = Members::new(&self.set, geometry.primitive_count());
-        let seed = HELDOUT_SEED + u64::from(round);
+        let members = StateMembers::new(&self.sets, geometry.primitive_count());
+        let seed = self.seed(HELDOUT_SEED, round);
         let mut test = ErrorTest::new(config.accuracy.target_error, round);
-        let mut wrong = Vec::new();
+        let mut wrong: Vec<Suspect> = Vec::new();
         for batch in 0.. {
-            let found = measure_scattered(geometry, &members, cell, batch, seed);
+            let found = measure_scattered_over(geometry, &members, timeline, cell, batch, seed);
             test.add(u64::from(SCATTERED_BATCH), found.len() as u64);
             wrong.extend(found);
             if test.verdict() != Verdict::Open {
                 break;
             }
         }
-        let heights = wrong.iter().map(|&v| relative_height(cell, v)).collect();
+        let heights = wrong.iter().map(|w| relative_height(cell, w.viewpoint)).collect();
+        let times = wrong.iter().map(|w| w.moment.t).collect();
+        let states = || wrong.iter().map(|w| w.moment.state);
+        let states = match (states().min(), states().max()) {
+            (Some(first), Some(last)) => first..last + 1,
+            _ => work.states.clone(),
+        };
         // They come in the order of directions: some of each batch and of each side.
         let some = wrong.len().min(SUSPECTS_MAX);
-        let wrong: Vec<DVec3> = (0..some).map(|k| wrong[k * wrong.len() / some]).collect();
-        let suspects = self.errors_at(&wrong, SUSPECT_SEED + u64::from(round));
+        let wrong: Vec<Suspect> = (0..some).map(|k| wrong[k * wrong.len() / some]).collect();
+        let suspects = self.errors_at(&wrong, self.seed(SUSPECT_SEED, round));
         self.heldout_rays += test.rays();
-        Finding { test, suspects: wrong.into_iter().zip(suspects).collect(), heights }
+        Finding {
+            test,
+            suspects: wrong.into_iter().zip(suspects).collect(),
+            heights,
+            times,
+            states,
+        }
     }
 
-    /// Errors at viewpoints, each measured in full.
-    fn errors_at(&mut self, viewpoints: &[DVec3], seed: u64) -> Vec<f64> {
-        self.heldout_rays += u64::from(SUSPECT_RAYS) * viewpoints.len() as u64;
-        let (geometry, id) = (&self.scene.geometry, self.cell.id);
+    /// Errors at viewpoints and moments, each measured in full.
+    fn errors_at(&mut self, at: &[Suspect], seed: u64) -> Vec<f64> {
+        self.heldout_rays += u64::from(SUSPECT_RAYS) * at.len() as u64;
+        let (geometry, id) = (&self.work.scene.geometry, self.cell.id);
         let found =
-            measure_viewpoints(geometry, &self.set, id, viewpoints, SUSPECT_RAYS, seed).viewpoints;
+            measure_viewpoints_at(geometry, &self.sets, id, at, SUSPECT_RAYS, seed).viewpoints;
         found.iter().map(|v| v.error).collect()
     }
 
     fn is_good(&self, found: &Finding) -> bool {
-        found.test.verdict() == Verdict::Met && found.worst() <= self.config.accuracy.worst_error
+        found.test.verdict() == Verdict::Met
+            && found.worst() <= self.work.config.accuracy.worst_error
     }
 
     /// Adds the work that what was found asks for.
     fn refine(&mut self, found: &Finding, round: u32) {
-        let accuracy = &self.config.accuracy;
+        let accuracy = &self.work.config.accuracy;
         let mean = found.test.mean();
         let met = found.test.verdict() == Verdict::Met;
         let in_vain = self.before_run.take().is_some_and(|before| mean > HELPED * before);
@@ -165,92 +205,111 @@ impl Sight<'_> {
         pockets.retain(|(_, error)| *error > bound);
         let thin = 2 * pockets.len() < found.suspects.len().max(1);
         pockets.sort_by(|a, b| b.1.total_cmp(&a.1));
-        for (viewpoint, _) in pockets {
-            self.look_from(viewpoint, bound, round);
+        for (suspect, _) in pockets {
+            self.look_from(suspect, bound, round, &found.states);
         }
         if thin && !met {
             self.before_run = Some(mean);
-            self.run(&found.heights, mean);
+            self.run(found, mean);
         }
     }
 
     /// Solves lines through a suspect while its error is over `bound`: along u, then along v. The
     /// lines of suspects before it may have been enough.
-    fn look_from(&mut self, viewpoint: DVec3, bound: f64, round: u32) {
+    fn look_from(&mut self, suspect: Suspect, bound: f64, round: u32, states: &Range<u32>) {
         for along_u in [true, false] {
-            let seed = SUSPECT_SEED + u64::from(round);
-            if self.errors_at(&[viewpoint], seed)[0] <= bound {
+            let seed = self.seed(SUSPECT_SEED, round);
+            if self.errors_at(&[suspect], seed)[0] <= bound {
                 return;
             }
-            let line = line_through(self.cell, viewpoint, along_u);
+            let line = line_through(self.cell, suspect.viewpoint, along_u);
             self.lines += 1;
-            self.solve(&[line]);
+            self.solve(&[(line, TimePath::stopped(suspect.moment.t))], states);
         }
     }
 
-    /// Solves another run along the perimeter, at the height where most of `wrong` are.
-    fn run(&mut self, wrong: &[f64], mean: f64) {
-        let limit = Sampling::new(self.config.solver.rows_max).rows();
-        let more = more_rows(self.rows, mean / self.config.accuracy.target_error);
+    /// Solves another run along the perimeter, at the height where most wrong rays are.
+    fn run(&mut self, found: &Finding, mean: f64) {
+        let config = self.work.config;
+        let limit = Sampling::new(config.solver.rows_max).rows();
+        let more = more_rows(self.rows, mean / config.accuracy.target_error);
         self.rows = Sampling::new(more).rows().min(limit);
-        let level = next_level(wrong, self.runs_at);
+        let level = next_level(&found.heights, self.runs_at);
         self.runs_at[level] += 1;
-        self.runs += 1;
         let segments = run_segments(self.cell, level);
-        self.solve(&segments);
+        let paths = if self.runs == 1 {
+            reversed_paths(&segments, &self.planned.segments)
+        } else {
+            let stop = next_stop(&mut self.stops, &found.times);
+            vec![TimePath::stopped(stop); segments.len()]
+        };
+        self.runs += 1;
+        let coupled: Vec<(ViewSegment, TimePath)> = segments.into_iter().zip(paths).collect();
+        self.solve(&coupled, &found.states);
     }
 
-    /// Solves segments of the cell alone, at the rows of the finest run, and finer where they see what
-    /// is not known yet.
-    fn solve(&mut self, segments: &[ViewSegment]) {
+    /// Solves segments of the cell alone in some states, at the rows of the finest run, and finer where
+    /// they see what is not known yet.
+    fn solve(&mut self, segments: &[(ViewSegment, TimePath)], states: &Range<u32>) {
         let sampling = Sampling::new(self.rows);
         let first = self.extra.len() as u32;
-        let numbered: Vec<ViewSegment> = (first..)
+        let numbered: Vec<(ViewSegment, TimePath)> = (first..)
             .zip(segments)
-            .map(|(number, segment)| ViewSegment { id: extra_id(self.cell, number), ..*segment })
-            .filter(|segment| segment.v0 != segment.v1)
+            .map(|(number, (segment, path))| {
+                (ViewSegment { id: extra_id(self.cell, number), ..*segment }, *path)
+            })
+            .filter(|(segment, _)| segment.v0 != segment.v1)
             .collect();
+        let known = self.sets.within(states.clone());
         let seen: Vec<Extra> = numbered
             .into_par_iter()
-            .map(|segment| {
-                let known = Some(&self.set);
-                let row = solve_segment(self.scene, &segment, sampling, self.config, known);
-                Extra { row, segment }
+            .map(|(segment, path)| {
+                let (states, known) = (states.clone(), Some(&known));
+                let rows = solve_segment(self.work, &segment, sampling, states, path, known);
+                Extra { rows, segment }
             })
             .collect();
-        self.solver_rays += seen.iter().map(|e| e.row.rays).sum::<u64>();
-        self.set = PrimitiveSet::union(seen.iter().map(|e| &e.row.set).chain([&self.set]));
+        self.solver_rays += seen.iter().flat_map(|e| &e.rows).map(|row| row.rays).sum::<u64>();
+        let whole = self.sets.states();
+        let mut all: Vec<StateSets> =
+            seen.iter().map(|e| sets_of(&e.rows).padded(whole.clone())).collect();
+        all.push(std::mem::replace(&mut self.sets, known));
+        self.sets = StateSets::join(&all);
         self.extra.extend(seen);
     }
 }
 
-/// The rows of a finished cell. `solved` are its planned segments and what they see.
+/// What a cell sees in the states of a task. `solved` are its planned segments and what they see in
+/// each of them.
 ///
 /// Runs on the current rayon pool.
 #[must_use]
 pub fn finish_cell(
-    scene: &Scene,
-    config: &BakeConfig,
+    work: &Work<'_>,
     planned: &PlannedCell,
-    solved: &[(&ViewSegment, &SegmentRow)],
+    solved: &[(&ViewSegment, &[SegmentRow])],
 ) -> CellOutput {
+    let Work { scene, timeline, config, states } = work;
     let (cell, accuracy) = (&planned.cell, &config.accuracy);
-    let inside = primitives_in_cell(&scene.geometry, cell);
+    let mut seen: Vec<StateSets> = solved.iter().map(|(_, rows)| sets_of(rows)).collect();
+    seen.push(primitives_in_cell_over(&scene.geometry, cell, states.clone()));
     let sampling = Sampling::new(config.solver.rows);
     let mut sight = Sight {
-        scene,
-        config,
+        work,
+        planned,
         cell,
-        set: PrimitiveSet::union(solved.iter().map(|(_, row)| &row.set).chain([&inside])),
+        sets: StateSets::join(&seen),
         extra: Vec::new(),
         runs: 1,
         lines: 0,
         rows: sampling.rows(),
         runs_at: planned_levels(config.solver.rings),
+        stops: Vec::new(),
         before_run: None,
-        solver_rays: solved.iter().map(|(_, row)| row.rays).sum(),
+        solver_rays: solved.iter().flat_map(|(_, rows)| *rows).map(|row| row.rays).sum(),
         heldout_rays: 0,
     };
+    drop(seen);
     let mut round = 0;
     let (found, target_met) = loop {
         let found = sight.measure(round);
@@ -264,10 +323,9 @@ pub fn finish_cell(
     let seen: Vec<Seen<'_>> = solved
         .iter()
         .copied()
-        .chain(sight.extra.iter().map(|e| (&e.segment, &e.row)))
-        .map(|(segment, row)| Seen { row, length: (segment.v1 - segment.v0).length() })
+        .chain(sight.extra.iter().map(|e| (&e.segment, &e.rows[..])))
+        .map(|(segment, rows)| Seen { rows, length: (segment.v1 - segment.v0).length() })
         .collect();
-    let weights = CellWeights::new(&sight.set, &seen);
     let effort = CellEffort {
         segments: seen.len() as u32,
         runs: sight.runs,
@@ -282,10 +340,70 @@ pub fn finish_cell(
         heldout_error_max: found.worst(),
         target_met,
     };
-    let objects = object_rows(scene, cell.id, &sight.set, &weights);
-    let (set, weights) = (sight.set, weights.codes());
-    let cell = CellRow { cell: cell.clone(), tile: planned.tile, set, weights, effort };
-    CellOutput { objects, cell }
+    let mut rows: Vec<(CellRow, CellWeights)> = sight
+        .sets
+        .runs()
+        .iter()
+        .map(|(states, set)| {
+            let weights = CellWeights::new(set, &seen, states, timeline);
+            let row = CellRow {
+                cell: cell.clone(),
+                tile: planned.tile,
+                first_state: states.start,
+                last_state: states.end - 1,
+                set: set.clone(),
+                weights: weights.codes(),
+                effort,
+            };
+            (row, weights)
+        })
+        .collect();
+    if !work.takes_all_states() {
+        let mut rows: Vec<CellRow> = rows.into_iter().map(|(row, _)| row).collect();
+        rows.sort_by_key(CellRow::order);
+        return CellOutput { rows, objects: Vec::new() };
+    }
+    if rows.len() > 1 {
+        let runs: Vec<CellRow> = rows.into_iter().map(|(row, _)| row).collect();
+        return join_cell(scene, timeline, &[&runs]);
+    }
+    let (row, weights) = rows.remove(0);
+    let objects = object_rows(scene, &row, &weights, std::slice::from_ref(&row));
+    CellOutput { objects, rows: vec![row] }
+}
+
+/// The same coupling, seen from the other end of a segment; and the other coupling from the same end.
+const fn reversed(path: TimePath) -> TimePath {
+    TimePath { t0: path.t1, t1: path.t0 }
+}
+
+/// For segments of a run, camera and time coupled the other way round than the plan has it on the same
+/// edge of the cell.
+fn reversed_paths(run: &[ViewSegment], planned: &[SegmentId]) -> Vec<TimePath> {
+    let path = |(k, segment): (usize, &ViewSegment)| {
+        // The plan's segments start with a ring; its vertical edges, if any, are behind all rings.
+        let own = planned.get(k).map_or(TimePath::FORWARD, |id| planned_path(*id));
+        // A planned segment starts at its lower end; a run goes round.
+        let same_way = segment.v0.to_array() < segment.v1.to_array();
+        if same_way { reversed(own) } else { own }
+    };
+    run.iter().enumerate().map(path).collect()
+}
+
+/// Where to stop the clock next: the stops 1/2; 1/4, 3/4; 1/8, 3/8, ... are taken in this order, and of
+/// those of one spacing first the one that most of `wrong` are near to.
+fn next_stop(stops: &mut Vec<f64>, wrong: &[f64]) -> f64 {
+    let level = (stops.len() as u32 + 1).ilog2();
+    let spacing = 1.0 / f64::from(1u32 << level);
+    let near = |stop: f64| wrong.iter().filter(|t| (*t - stop).abs() <= spacing / 2.0).count();
+    let free = (0..1u32 << level)
+        .map(|k| (f64::from(k) + 0.5) * spacing)
+        .filter(|stop| !stops.contains(stop))
+        // The first of equally good ones.
+        .reduce(|best, stop| if near(stop) > near(best) { stop } else { best });
+    let stop = free.expect("a level has more stops than were taken of it");
+    stops.push(stop);
+    stop
 }
 
 /// Rows of the next run, behind one of `rows` rows that left so many times the target.
@@ -398,6 +516,23 @@ mod tests {
         assert_eq!(next_level(&[0.1, 0.05, 0.0, 0.9], [9, 1, 0]), 2, "the bottom was solved often");
         assert_eq!(next_level(&[0.5; 9], [0, 3, 0]), 1, "a flat cell has its middle only");
         assert_eq!(next_level(&[], [1, 1, 1]), 1);
+    }
+
+    #[test]
+    fn the_clock_stops_where_most_goes_wrong() {
+        let mut stops = Vec::new();
+        let wrong = [0.9, 0.8, 0.1];
+        let taken: Vec<f64> = (0..7).map(|_| next_stop(&mut stops, &wrong)).collect();
+        assert_eq!(taken, [0.5, 0.75, 0.25, 0.875, 0.125, 0.375, 0.625]);
+    }
+
+    #[test]
+    fn the_first_run_turns_the_plan_round() {
+        let run = run_segments(&cell(), 1);
+        let paths = reversed_paths(&run, &[0, 1, 2, 5].map(SegmentId));
+        // The third edge runs against its planned segment.
+        let (with, against) = (TimePath::FORWARD, TimePath::REVERSED);
+        assert_eq!(paths, [against, with, with, with]);
     }
 
     #[test]

@@ -54,6 +54,19 @@ pub enum WorkerError {
         /// The digest in the plan.
         expected: String,
     },
+    /// The scene has other states than the plan.
+    #[error(
+        "{path} has {found} states, and the plan of this bake {expected}: it was read otherwise than \
+         by the coordinator. Run the same version of both"
+    )]
+    OtherStates {
+        /// The scene that was opened.
+        path: String,
+        /// Its number of states.
+        found: u32,
+        /// That in the plan.
+        expected: u32,
+    },
     /// The plan cannot be read.
     #[error("the plan of bake {bake_id} cannot be used: {source}")]
     Plan {

@@ -12,6 +12,7 @@ mod cache;
 mod cell;
 mod connection;
 mod error;
+mod join;
 mod pool;
 pub mod solve;
 mod weights;

@@ -174,19 +174,31 @@ impl Life {
             Some(scene) => Arc::clone(scene),
             None => self.read_scene(&path, plan).await?,
         };
-        if scene.digest.combined == session.scene_digest {
-            return Ok(scene);
+        if scene.digest.combined != session.scene_digest {
+            return Err(WorkerError::OtherScene {
+                path: path.display().to_string(),
+                found: scene.digest.combined.clone(),
+                expected: session.scene_digest.clone(),
+            });
         }
-        Err(WorkerError::OtherScene {
-            path: path.display().to_string(),
-            found: scene.digest.combined.clone(),
-            expected: session.scene_digest.clone(),
-        })
+        let (found, expected) = (scene.geometry.states, plan.states());
+        if found != expected {
+            let path = path.display().to_string();
+            return Err(WorkerError::OtherStates { path, found, expected });
+        }
+        Ok(scene)
     }
 
     async fn read_scene(&self, path: &Path, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
-        let mut options = OpenOptions::default();
-        options.see_through.clone_from(&plan.config.scene.see_through);
+        // As the coordinator did.
+        let asked = &plan.config.scene;
+        let options = OpenOptions::of_bake(
+            path,
+            &asked.see_through,
+            &asked.particles,
+            asked.animation.as_deref(),
+            asked.motion_error,
+        );
         let path = path.to_owned();
         let read = self.pool.run(move || Scene::open(&path, &options)).await;
         let scene = read.map_err(|panic| WorkerError::Defect(panic.to_string()))??;

@@ -1,15 +1,18 @@
 //! A worker against a coordinator that only hands out tasks in order, over real loopback gRPC.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use glam::DVec3;
+use glam::{DAffine3, DVec3};
 use prost::Message;
-use sightline_geometry::{CellId, ViewCell};
+use sightline_geometry::{
+    Bounds, CellId, Instance, InstancedGeometry, Mesh, MeshId, ObjectId, ParticleSystem,
+    PrimitiveId, PrimitiveSet, SegmentId, Sphere, ViewCell,
+};
 use sightline_jobs::{BakeConfig, Plan, SceneRef, SkippedCells, TaskId, TiledCell, plan};
 use sightline_proto::encode_plan;
 use sightline_proto::v1::coordinator_server::{Coordinator, CoordinatorServer};
@@ -18,9 +21,9 @@ use sightline_scene::generate::{Kind, generate};
 use sightline_scene::region::{Heights, RegionSpec, tile};
 use sightline_scene::{OpenOptions, Scene};
 use sightline_store::{
-    BakeStore, CellRow, ObjectRow, Weight, decode_cell_part, decode_object_part, keys,
+    BakeStore, CellRow, ObjectRow, SegmentRow, Weight, decode_cell_part, decode_object_part, keys,
 };
-use sightline_worker::solve::{Cancel, CellOutput, solve_cells, solve_segments};
+use sightline_worker::solve::{Cancel, CellOutput, Work, join_cells, solve_cells, solve_segments};
 use sightline_worker::{Worker, WorkerError, WorkerOptions, WorkerSummary};
 use tonic::{Request, Response, Status};
 
@@ -144,7 +147,8 @@ fn sample(folder: &Path, tasks: (u32, u32)) -> (PathBuf, Plan) {
         digest: scene.digest.combined.clone(),
         files: vec![],
     };
-    let plan = plan(reference, config, cells, SkippedCells(tiled.skipped));
+    let key_times = scene.key_times.clone();
+    let plan = plan(reference, config, key_times, cells, SkippedCells(tiled.skipped));
     (path, plan)
 }
 
@@ -177,11 +181,21 @@ async fn serve(plan: &Plan, scene: &Path, digest: &str) -> Fake {
 }
 
 async fn work(plan: &Plan, scene: &Path, threads: usize) -> (BakeStore, WorkerSummary) {
+    work_with(plan, scene, None, threads).await
+}
+
+async fn work_with(
+    plan: &Plan,
+    scene: &Path,
+    in_memory: Option<Arc<Scene>>,
+    threads: usize,
+) -> (BakeStore, WorkerSummary) {
     let store = BakeStore::in_memory();
     store.create(&keys::plan(&plan.bake_id), encode_plan(plan)).await.unwrap();
     let fake = serve(plan, scene, &plan.scene.digest).await;
     let mut options = WorkerOptions::new(&fake.url);
     options.store = Some(store.clone());
+    options.scene = in_memory;
     options.threads = threads;
     let summary = Worker::run(options, std::future::pending()).await.unwrap();
     assert_eq!(fake.committed.lock().unwrap().len(), plan.tasks.len());
@@ -190,7 +204,7 @@ async fn work(plan: &Plan, scene: &Path, threads: usize) -> (BakeStore, WorkerSu
 
 async fn rows(store: &BakeStore, plan: &Plan) -> (Vec<CellRow>, Vec<ObjectRow>) {
     let (mut cells, mut objects) = (Vec::new(), Vec::new());
-    for task in plan.cell_tasks() {
+    for task in plan.final_tasks() {
         let commit = store.get(&keys::commit(&plan.bake_id, task.id.0)).await.unwrap();
         let commit = v1::Commit::decode(commit).unwrap();
         let [first, second] = &commit.parts[..] else { panic!("{commit:?}") };
@@ -249,21 +263,47 @@ fn three_triangles(folder: &Path) -> Scene {
     Scene::open(&folder.join("scene.gltf"), &OpenOptions::default()).unwrap()
 }
 
-/// One cell of 1 m at the origin, at height 0.4, finished without tasks.
-fn finish_one(scene: &Scene, config: BakeConfig) -> (CellRow, Vec<ObjectRow>) {
+/// A plan of one cell of 1 m at the origin, at height 0.4.
+fn plan_one(scene: &Scene, config: BakeConfig) -> Plan {
     let corner = |x: f64, z: f64| DVec3::new(x, 0.4, z);
     let corners = [corner(-0.5, -0.5), corner(0.5, -0.5), corner(0.5, 0.5), corner(-0.5, 0.5)];
     let cell = ViewCell { id: CellId(0), corners, height: 0.1 };
     let tiled = vec![TiledCell { cell, tile: [0, 0] }];
-    let reference =
-        SceneRef { uri: String::new(), name: String::new(), digest: String::new(), files: vec![] };
-    let plan = plan(reference, config, tiled, SkippedCells::default());
-    let never = Cancel::default();
-    let rows = solve_segments(scene, &plan.segments, &plan.config, &never).unwrap();
-    let rows = rows.into_iter().map(|row| (row.segment, row)).collect();
-    let done = solve_cells(scene, &plan.cells, &plan.segments, &rows, &plan.config, &never);
-    let CellOutput { cell, objects } = done.unwrap().remove(0);
-    (cell, objects)
+    let reference = SceneRef {
+        uri: String::new(),
+        name: String::new(),
+        digest: scene.digest.combined.clone(),
+        files: vec![],
+    };
+    plan(reference, config, scene.key_times.clone(), tiled, SkippedCells::default())
+}
+
+/// The rows of all cells of a plan, finished without tasks: range by range of states, then joined.
+fn finish_all(scene: &Scene, plan: &Plan) -> Vec<CellOutput> {
+    let (never, timeline, mut ranges) = (Cancel::default(), plan.timeline(), Vec::new());
+    let (all, a_task) = (plan.states(), plan.config.tasks.states_per_task);
+    for first in (0..all).step_by(a_task as usize) {
+        let states = first..all.min(first + a_task);
+        let work = Work { scene, timeline: &timeline, config: &plan.config, states };
+        let solved = solve_segments(&work, &plan.segments, &never).unwrap();
+        let mut rows: BTreeMap<SegmentId, Vec<SegmentRow>> = BTreeMap::new();
+        solved.into_iter().for_each(|row| rows.entry(row.segment).or_default().push(row));
+        let done = solve_cells(&work, &plan.cells, &plan.segments, &rows, &never).unwrap();
+        if work.takes_all_states() {
+            return done;
+        }
+        assert!(done.iter().all(|cell| cell.objects.is_empty()));
+        ranges.push(done.into_iter().flat_map(|cell| cell.rows).collect());
+    }
+    join_cells(scene, &timeline, &ranges)
+}
+
+/// One cell of a scene at rest.
+fn finish_one(scene: &Scene, config: BakeConfig) -> (CellRow, Vec<ObjectRow>) {
+    let CellOutput { mut rows, objects } = finish_all(scene, &plan_one(scene, config)).remove(0);
+    assert_eq!(rows.len(), 1, "a scene at rest has one row a cell");
+    assert_eq!(rows[0].states(), 0..1);
+    (rows.remove(0), objects)
 }
 
 #[test]
@@ -312,11 +352,9 @@ fn a_hard_target_gets_more_rows_and_runs_and_says_when_they_were_not_enough() {
         let mut config = plan.config.clone();
         (config.solver.rows, config.solver.rows_max) = (8, 40);
         (config.accuracy.rounds, config.accuracy.target_error) = (rounds, target);
-        let never = Cancel::default();
-        let rows = solve_segments(&scene, &plan.segments, &config, &never).unwrap();
-        let rows = rows.into_iter().map(|row| (row.segment, row)).collect();
-        let (cells, segments) = (&plan.cells[..1], &plan.segments);
-        solve_cells(&scene, cells, segments, &rows, &config, &never).unwrap().remove(0).cell
+        let mut one = plan.clone();
+        (one.config, one.cells) = (config, vec![plan.cells[0].clone()]);
+        finish_all(&scene, &one).remove(0).rows.remove(0)
     };
     let (coarse, refined, again) = (finish(0), finish(2), finish(2));
     assert_eq!(refined, again, "a function of its input alone");
@@ -375,4 +413,164 @@ async fn nobody_there_is_an_error_that_says_what_to_do() {
     let options = WorkerOptions::new("somewhere");
     let error = Worker::run(options, std::future::pending()).await.unwrap_err();
     assert!(matches!(error, WorkerError::BadUrl { .. }));
+}
+
+/// A wall; a panel that is behind it, comes forward in the second of five states, stands before it in the
+/// third and goes back in the fourth; and a ball that is there in the last two.
+fn crossing(folder: &Path) -> Scene {
+    let mut scene = three_triangles(folder);
+    let square = |half: f32| {
+        let corners =
+            vec![[-half, -half, 0.0], [half, -half, 0.0], [half, half, 0.0], [-half, half, 0.0]];
+        Mesh::new(corners, &[[0, 1, 2], [0, 2, 3]]).0
+    };
+    let at = |z: f64| DAffine3::from_translation(DVec3::new(0.0, 0.4, z));
+    let instance = |mesh: u32, motion: Option<Box<[DAffine3]>>| Instance {
+        mesh: MeshId(mesh),
+        object: ObjectId(mesh),
+        world_from_mesh: motion.as_ref().map_or(at(-6.0), |keys| keys[0]),
+        first_primitive: PrimitiveId(2 * mesh),
+        occluder: true,
+        motion,
+    };
+    let instances = vec![
+        instance(0, None),
+        instance(1, Some([-9.0, -9.0, -3.0, -3.0, -9.0, -9.0].map(at).into())),
+    ];
+    let ball = vec![Sphere { center: [2.0, 0.4, -4.0], radius: 0.3 }];
+    let gone = vec![Sphere::ABSENT];
+    let keys = vec![gone.clone(), gone.clone(), gone, ball.clone(), ball.clone(), ball];
+    let (system, _) = ParticleSystem::new(ObjectId(2), PrimitiveId(4), true, DVec3::ZERO, keys);
+    scene.geometry =
+        InstancedGeometry::with_motion(vec![square(9.0), square(0.5)], instances, vec![system], 5);
+    for (object, (name, primitives)) in
+        scene.objects.iter_mut().zip([("wall", 0..2), ("panel", 2..4), ("ball", 4..5)])
+    {
+        object.name = name.into();
+        object.primitives = primitives;
+        object.bounds = Bounds { min: DVec3::splat(-9.0), max: DVec3::splat(9.0) };
+    }
+    scene.key_times = vec![0.0, 1.0, 2.0, 3.0, 5.0, 6.0];
+    scene
+}
+
+fn moving_config(states_per_task: u32) -> BakeConfig {
+    let mut config = BakeConfig::default();
+    config.region.rectangles = vec![[0.0, 0.0, 1.0, 1.0]];
+    config.solver.rows = 64;
+    config.tasks.states_per_task = states_per_task;
+    config
+}
+
+fn set(members: &[u32]) -> PrimitiveSet {
+    PrimitiveSet::from_sorted(members.iter().copied())
+}
+
+#[test]
+fn what_moves_has_a_row_a_run_of_states_and_one_of_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = crossing(folder.path());
+    let CellOutput { rows, objects } =
+        finish_all(&scene, &plan_one(&scene, moving_config(32))).remove(0);
+    let found: Vec<_> = rows.iter().map(|row| (row.states(), row.set.clone())).collect();
+    // All states first, the longest run next, then by time.
+    assert_eq!(
+        found,
+        [
+            (0..5, set(&[0, 1, 2, 3, 4])),
+            (1..3, set(&[0, 1, 2, 3])),
+            (0..1, set(&[0, 1])),
+            (3..4, set(&[0, 1, 2, 3, 4])),
+            (4..5, set(&[0, 1, 4])),
+        ]
+    );
+    let states: Vec<_> = objects.iter().map(|o| (o.first_state, o.last_state)).collect();
+    assert_eq!(states, [(0, 4), (1, 3), (3, 4)]);
+    assert!(rows.iter().all(|row| row.effort.target_met && row.effort == rows[0].effort));
+    // The ball is there for three seconds of six, and weighs half as much in the mean of all.
+    let weight = |row: &CellRow| row.weights.last().unwrap().share().unwrap();
+    let ratio = weight(&rows[4]) / weight(&rows[0]);
+    assert!((1.6..2.5).contains(&ratio), "{ratio}");
+    assert!((objects[2].weight / weight(&rows[0]) - 1.0).abs() <= Weight::RELATIVE_ERROR);
+    for row in &rows {
+        let whole: f64 = row.weights.iter().filter_map(|w| w.share()).sum();
+        assert!(whole > 0.0 && whole <= 1.0 + Weight::RELATIVE_ERROR, "{whole}");
+    }
+}
+
+#[test]
+fn sets_do_not_depend_on_how_states_are_cut_where_nothing_is_refined() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = crossing(folder.path());
+    let finish = |states_per_task| {
+        finish_all(&scene, &plan_one(&scene, moving_config(states_per_task))).remove(0)
+    };
+    let whole = finish(32);
+    assert_eq!(whole.rows[0].effort.refinements, 0, "{:?}", whole.rows[0].effort);
+    for states_per_task in [1, 2, 4] {
+        let joined = finish(states_per_task);
+        assert_eq!(joined.rows.len(), whole.rows.len());
+        for (a, b) in whole.rows.iter().zip(&joined.rows) {
+            assert_eq!((a.states(), &a.set), (b.states(), &b.set), "{states_per_task} a task");
+            let near = |(a, b): (&Weight, &Weight)| a.code().abs_diff(b.code()) <= 1;
+            assert!(a.weights.iter().zip(&b.weights).all(near), "weights differ by rounding");
+        }
+        for (a, b) in whole.objects.iter().zip(&joined.objects) {
+            let seen =
+                |o: &ObjectRow| (o.object, o.visible_primitives, o.first_state, o.last_state);
+            assert_eq!(seen(a), seen(b));
+        }
+        let ranges = 5u32.div_ceil(states_per_task);
+        let effort = joined.rows[0].effort;
+        assert_eq!((effort.segments, effort.runs), (4 * ranges, ranges));
+        assert!(effort.target_met);
+    }
+}
+
+#[test]
+fn refinement_finds_more_of_what_moves_and_is_repeatable() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = crossing(folder.path());
+    let finish = |rounds| {
+        let mut config = moving_config(32);
+        (config.solver.rows, config.accuracy.rounds) = (2, rounds);
+        config.accuracy.target_error = 0.000_05;
+        finish_all(&scene, &plan_one(&scene, config)).remove(0).rows
+    };
+    let (coarse, refined) = (finish(0), finish(6));
+    assert_eq!(refined, finish(6), "a function of its input alone");
+    let [a, b] = [&coarse[0].effort, &refined[0].effort];
+    assert!(!a.target_met && b.refinements >= 1, "{a:?} {b:?}");
+    assert!(b.heldout_error_mean < a.heldout_error_mean, "{a:?} {b:?}");
+    assert_eq!(b.segments, 4 * b.runs + b.lines);
+    assert!(coarse[0].set.iter().all(|p| refined[0].set.contains(p)), "nothing is lost");
+}
+
+#[tokio::test]
+async fn ranges_of_states_are_joined_from_parts_as_without_tasks() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = Arc::new(crossing(folder.path()));
+    let plan = plan_one(&scene, moving_config(2));
+    assert_eq!(plan.tasks.len(), 3 + 3 + 1, "three ranges of states, and their join");
+    let path = folder.path().join("scene.gltf");
+    let (store, summary) = work_with(&plan, &path, Some(Arc::clone(&scene)), 2).await;
+    assert_eq!(summary.failures, 0);
+    let (cells, objects) = rows(&store, &plan).await;
+    let expected = finish_all(&scene, &plan).remove(0);
+    assert_eq!((cells, objects), (expected.rows, expected.objects));
+}
+
+#[tokio::test]
+async fn a_scene_with_other_states_than_the_plan_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut scene = crossing(folder.path());
+    let plan = plan_one(&scene, moving_config(2));
+    scene.geometry.states = 1;
+    let store = BakeStore::in_memory();
+    store.create(&keys::plan(&plan.bake_id), encode_plan(&plan)).await.unwrap();
+    let fake = serve(&plan, &folder.path().join("scene.gltf"), &plan.scene.digest).await;
+    let mut options = WorkerOptions::new(&fake.url);
+    (options.store, options.scene) = (Some(store), Some(Arc::new(scene)));
+    let error = Worker::run(options, std::future::pending()).await.unwrap_err();
+    assert!(matches!(error, WorkerError::OtherStates { found: 1, expected: 5, .. }), "{error}");
 }

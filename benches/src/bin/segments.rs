@@ -76,7 +76,7 @@ fn main() {
                 passes: arguments.passes,
                 threshold: arguments.threshold,
                 known: arguments.known.then_some(&known),
-                portable: false,
+                ..SolveOptions::default()
             };
             found = Some(solve_segment_with(&scene.geometry, segment, sampling, &options));
             least = least.min(began.elapsed().as_secs_f64());

@@ -30,7 +30,7 @@ pub struct Arguments {
 /// The commands.
 #[derive(Debug, Subcommand)]
 pub enum Task {
-    /// Write a deterministic benchmark scene as glTF.
+    /// Write a deterministic benchmark scene as glTF, or as a particle table.
     Generate(Generate),
     /// Bake the visible sets of a scene into a dataset, on this machine.
     Bake(Box<Bake>),
@@ -74,6 +74,10 @@ pub enum SceneKind {
     Town,
     /// A meadow of instanced grass and flowers.
     Grass,
+    /// The same meadow in the wind: every blade moves.
+    SwayingGrass,
+    /// Spheres that bounce on the ground until they rest, as a Parquet or CSV table.
+    BouncingSpheres,
 }
 
 /// `generate`.
@@ -81,14 +85,22 @@ pub enum SceneKind {
 pub struct Generate {
     /// What to generate.
     pub kind: SceneKind,
-    /// Triangles, instances counted: within 2 % of it. `200k` and `3.7M` are understood.
-    #[arg(long, default_value = "200k", value_name = "N", value_parser = parse_count)]
-    pub triangles: u64,
+    /// Triangles, instances counted: within 2 % of it. `200k` and `3.7M` are understood; 200k when
+    /// absent. Not for bouncing-spheres.
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub triangles: Option<u64>,
+    /// Spheres of bouncing-spheres; 10k when absent.
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub count: Option<u64>,
+    /// States of bouncing-spheres and swaying-grass: stretches of linear motion between two key
+    /// frames; 25 and 10 when absent.
+    #[arg(long, value_name = "K")]
+    pub states: Option<u32>,
     /// Scenes of the same kind, size and seed are the same, byte for byte.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// The file to write.
-    #[arg(short, long, value_name = "SCENE.glb")]
+    /// The file to write: SCENE.glb, or SCENE.parquet or SCENE.csv for bouncing-spheres.
+    #[arg(short, long, value_name = "SCENE")]
     pub out: PathBuf,
     /// Print one JSON object.
     #[arg(long)]
@@ -196,6 +208,9 @@ pub struct Verify {
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     #[arg(requires = "cell", conflicts_with = "viewpoints")]
     pub viewpoint: Option<glam::DVec3>,
+    /// When that viewpoint is looked at: a state, and how far it has gone, from 0 to 1.
+    #[arg(long, value_name = "STATE,T", value_parser = parse_moment, requires = "viewpoint")]
+    pub moment: Option<sightline_geometry::Moment>,
     /// Seed of viewpoints and directions.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
@@ -319,6 +334,10 @@ pub struct ConfigFlags {
 enum Shape {
     /// One TOML value as it is.
     Plain,
+    /// One text, whatever it looks like.
+    Text,
+    /// Repeatable files.
+    Files,
     /// Repeatable patterns.
     Patterns,
     /// Repeatable rectangles.
@@ -331,6 +350,8 @@ enum Shape {
 
 fn shape(key: &KeyDoc) -> Shape {
     match key.kind {
+        "text or an integer" => Shape::Text,
+        "list of paths" => Shape::Files,
         "list of glob patterns" => Shape::Patterns,
         "list of [x0, z0, x1, z1]" => Shape::Rectangles,
         "list of lists of [x, z]" => Shape::Polygons,
@@ -360,8 +381,8 @@ fn flag_help(key: &KeyDoc) -> String {
     }
     match shape(key) {
         Shape::Patterns => help.push_str(" Can be repeated; an empty text stands for no pattern."),
-        Shape::Rectangles | Shape::Polygons => help.push_str(" Can be repeated."),
-        Shape::Plain | Shape::Range => {}
+        Shape::Rectangles | Shape::Polygons | Shape::Files => help.push_str(" Can be repeated."),
+        Shape::Plain | Shape::Text | Shape::Range => {}
     }
     help
 }
@@ -377,6 +398,8 @@ impl Args for ConfigFlags {
                 .allow_hyphen_values(true);
             let arg = match shape(key) {
                 Shape::Plain => arg.value_name("VALUE"),
+                Shape::Text => arg.value_name("NAME"),
+                Shape::Files => arg.value_name("FILE").action(ArgAction::Append),
                 Shape::Patterns => arg.value_name("PATTERN").action(ArgAction::Append),
                 Shape::Rectangles => arg
                     .value_name("X0,Z0,X1,Z1")
@@ -420,14 +443,18 @@ fn toml_value(shape: Shape, values: &[&str]) -> String {
     match shape {
         Shape::Plain | Shape::Range => values.last().copied().unwrap_or_default().to_owned(),
         Shape::Rectangles | Shape::Polygons => format!("[{}]", values.join(", ")),
-        Shape::Patterns => {
-            // A JSON string is a TOML string.
-            let quoted = values.iter().filter(|v| !v.is_empty());
+        Shape::Text => quoted(values.last().copied().unwrap_or_default()),
+        Shape::Patterns | Shape::Files => {
             let quoted: Vec<String> =
-                quoted.map(|v| serde_json::Value::from(*v).to_string()).collect();
+                values.iter().filter(|v| !v.is_empty()).map(|v| quoted(v)).collect();
             format!("[{}]", quoted.join(", "))
         }
     }
+}
+
+/// A JSON string is a TOML string.
+fn quoted(text: &str) -> String {
+    serde_json::Value::from(text).to_string()
 }
 
 fn numbers(text: &str) -> Result<Vec<f64>, String> {
@@ -469,6 +496,16 @@ fn parse_point(text: &str) -> Result<glam::DVec3, String> {
         [x, y, z] => Ok(glam::DVec3::new(x, y, z)),
         _ => Err("give three numbers: x,y,z".into()),
     }
+}
+
+fn parse_moment(text: &str) -> Result<sightline_geometry::Moment, String> {
+    let parse = |text: &str| {
+        let (state, t) = text.split_once(',')?;
+        let t: f64 = t.trim().parse().ok()?;
+        let moment = sightline_geometry::Moment { state: state.trim().parse().ok()?, t };
+        (0.0..=1.0).contains(&t).then_some(moment)
+    };
+    parse(text).ok_or_else(|| "give a state and a share of it from 0 to 1: state,t".into())
 }
 
 fn parse_cell(text: &str) -> Result<CellId, String> {

@@ -217,6 +217,14 @@ impl From<GenerateError> for Failure {
         match &error {
             GenerateError::Size { .. } => Self::new(Kind::Usage, error.to_string())
                 .with_help("give --triangles in that range"),
+            GenerateError::Spheres { .. } => {
+                Self::new(Kind::Usage, error.to_string()).with_help("give --count in that range")
+            }
+            GenerateError::States { .. } => {
+                Self::new(Kind::Usage, error.to_string()).with_help("give --states in that range")
+            }
+            GenerateError::Table(source) => Self::new(Kind::Store, format!("{error}: {source}"))
+                .with_help("check the rights and the free space of the folder"),
             GenerateError::Write(source) => Self::new(Kind::Store, format!("{error}: {source}"))
                 .with_help("check the rights and the free space of the folder"),
         }
@@ -289,9 +297,9 @@ impl From<WorkerError> for Failure {
             WorkerError::BadUrl { .. } | WorkerError::Threads { .. } => {
                 Self::new(Kind::Usage, text)
             }
-            WorkerError::OtherScene { .. } | WorkerError::Plan { .. } => {
-                Self::new(Kind::Input, text)
-            }
+            WorkerError::OtherScene { .. }
+            | WorkerError::OtherStates { .. }
+            | WorkerError::Plan { .. } => Self::new(Kind::Input, text),
             WorkerError::Unreachable { .. } => Self::new(Kind::Network, text),
             WorkerError::Refused(_) => Self::new(Kind::Network, text)
                 .with_help("run the same version of Sightline as the coordinator"),

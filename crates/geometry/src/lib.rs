@@ -24,6 +24,7 @@ mod particles;
 pub mod raycast;
 mod set;
 mod state_sets;
+mod timeline;
 mod view;
 mod wide;
 
@@ -39,6 +40,7 @@ pub use particles::{ParticleSystem, Sphere};
 pub use raycast::{Hit, Ray};
 pub use set::{PrimitiveSet, Run};
 pub use state_sets::StateSets;
+pub use timeline::Timeline;
 pub use view::{ViewCell, ViewSegment};
 
 /// Unit roundoff of `f64`, 2^-53: the relative error of one correctly rounded operation.

@@ -79,6 +79,40 @@ impl StateSets {
         &self.runs[self.run_of(state)].1
     }
 
+    /// The sets of some of the states.
+    ///
+    /// # Panics
+    /// Without a state, or when one is not covered.
+    #[must_use]
+    pub fn within(&self, states: Range<u32>) -> Self {
+        let own = self.states();
+        assert!(own.start <= states.start && states.end <= own.end, "{states:?} of {own:?}");
+        let cut = |run: &Range<u32>| run.start.max(states.start)..run.end.min(states.end);
+        Self::from_runs(
+            self.runs
+                .iter()
+                .map(|(run, set)| (cut(run), set))
+                .filter(|(run, _)| !run.is_empty())
+                .map(|(run, set)| (run, set.clone())),
+        )
+    }
+
+    /// The same over more states: empty sets where there were none.
+    ///
+    /// # Panics
+    /// When `states` does not hold those that are covered.
+    #[must_use]
+    pub fn padded(&self, states: Range<u32>) -> Self {
+        let own = self.states();
+        assert!(states.start <= own.start && own.end <= states.end, "{own:?} of {states:?}");
+        let empty = |states: Range<u32>| {
+            Some((states, PrimitiveSet::default())).filter(|(states, _)| !states.is_empty())
+        };
+        let before = empty(states.start..own.start);
+        let behind = empty(own.end..states.end);
+        Self::from_runs(before.into_iter().chain(self.runs.iter().cloned()).chain(behind))
+    }
+
     /// What is visible in any state.
     #[must_use]
     pub fn union(&self) -> PrimitiveSet {
@@ -126,6 +160,10 @@ mod tests {
         let both = StateSets::join([&sets, &other]);
         let expected = [(2..4, set(&[1, 7])), (4..5, set(&[1])), (5..6, set(&[1, 2]))];
         assert_eq!(both.runs(), expected);
+        assert_eq!(both.within(3..5).runs(), [(3..4, set(&[1, 7])), (4..5, set(&[1]))]);
+        let padded = both.within(4..5).padded(2..6);
+        assert_eq!(padded.runs(), [(2..4, set(&[])), (4..5, set(&[1])), (5..6, set(&[]))]);
+        assert_eq!(padded.within(4..5).padded(4..5), both.within(4..5));
         assert_eq!(StateSets::constant(0..9, set(&[3])).at(8), &set(&[3]));
     }
 }

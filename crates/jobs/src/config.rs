@@ -4,7 +4,9 @@
 //! texts and pages are made from it, and a test compares it with the structs below.
 //!
 //! The dataset is a function of the scene and of every section but `[tasks]`: [`BakeConfig::hash`]
-//! covers exactly those sections.
+//! covers exactly those sections. Where something moves there is one exception: a cell is measured and
+//! refined range by range of states, so what refinement adds depends on `tasks.states_per_task`, as it
+//! does on where held-out rays happen to start.
 
 use std::fmt;
 
@@ -22,11 +24,11 @@ pub struct BakeConfig {
     pub solver: SolverConfig,
     /// How close to the full scene the sets have to come.
     pub accuracy: AccuracyConfig,
-    /// How the work is cut into tasks. Does not change the dataset.
+    /// How the work is cut into tasks. Does not change the dataset of a scene at rest.
     pub tasks: TaskConfig,
 }
 
-/// `[scene]`: how objects take part, by glob patterns on their names.
+/// `[scene]`: how objects take part, by glob patterns on their names, and what moves.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SceneConfig {
@@ -34,6 +36,28 @@ pub struct SceneConfig {
     pub see_through: Vec<String>,
     /// Objects that viewers can stand on.
     pub ground: Vec<String>,
+    /// Which of the file's animations moves the scene: a name, a number, `all` or `none`; absent: as
+    /// the reader of scenes has it.
+    #[serde(skip_serializing_if = "Option::is_none", deserialize_with = "name_or_number")]
+    pub animation: Option<String>,
+    /// How far a vertex may be from where its animation has it, metres.
+    pub motion_error: f64,
+    /// Files with particles.
+    pub particles: Vec<String>,
+}
+
+/// A name, or a number that stands for its decimal form.
+fn name_or_number<'de, D: serde::Deserializer<'de>>(from: D) -> Result<Option<String>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "expected a name or a number from 0")]
+    enum Written {
+        Name(String),
+        Number(u32),
+    }
+    Ok(Some(match Written::deserialize(from)? {
+        Written::Name(name) => name,
+        Written::Number(number) => number.to_string(),
+    }))
 }
 
 /// `[region]`: where viewers can be.
@@ -110,11 +134,19 @@ pub struct TaskConfig {
     pub segments_per_task: u32,
     /// Cells of a cells task.
     pub cells_per_task: u32,
+    /// States of a segments or cells task.
+    pub states_per_task: u32,
 }
 
 impl Default for SceneConfig {
     fn default() -> Self {
-        Self { see_through: vec!["*glass*".into()], ground: vec!["*".into()] }
+        Self {
+            see_through: vec!["*glass*".into()],
+            ground: vec!["*".into()],
+            animation: None,
+            motion_error: 0.01,
+            particles: Vec::new(),
+        }
     }
 }
 
@@ -145,7 +177,7 @@ impl Default for AccuracyConfig {
 
 impl Default for TaskConfig {
     fn default() -> Self {
-        Self { segments_per_task: 32, cells_per_task: 16 }
+        Self { segments_per_task: 32, cells_per_task: 16, states_per_task: 32 }
     }
 }
 
@@ -189,6 +221,31 @@ pub const KEYS: &[KeyDoc] = &[
         "[\"*\"]",
         "",
         "Names of objects that viewers can stand on.",
+    ),
+    key(
+        "scene.animation",
+        "text or an integer",
+        "",
+        "",
+        "The animation of the scene file that moves it: its name or its number from 0, \"all\" to play \
+         all of them at once, or \"none\" to bake the scene at rest; absent: the first where there is \
+         one.",
+    ),
+    key(
+        "scene.motion_error",
+        "number",
+        "0.01",
+        "metres",
+        "Farthest that anything may be from where its animation has it: key frames are chosen so that \
+         straight motion between them stays within it. Smaller values give more states.",
+    ),
+    key(
+        "scene.particles",
+        "list of paths",
+        "[]",
+        "",
+        "Files with particles, spheres that are seen beside the triangles of the scene; relative paths \
+         start at the scene file.",
     ),
     key(
         "region.rectangles",
@@ -296,6 +353,14 @@ pub const KEYS: &[KeyDoc] = &[
         "16",
         "cells",
         "Cells that a worker finishes in one task. Does not change the dataset.",
+    ),
+    key(
+        "tasks.states_per_task",
+        "integer",
+        "32",
+        "states",
+        "States of a moving scene that a worker takes in one task. Each cell is measured and refined \
+         once for all states of a task; a scene at rest has one state, and its dataset does not change.",
     ),
 ];
 
@@ -433,6 +498,27 @@ impl SceneConfig {
             &self.ground,
             "holds an empty pattern",
             "remove it, or write [\"*\"] to stand on everything",
+        )?;
+        require(
+            self.animation.as_ref().is_none_or(|name| !name.is_empty()),
+            "scene.animation",
+            &self.animation,
+            "names no animation",
+            "give a name, a number, \"all\" or \"none\", or leave the key out",
+        )?;
+        require(
+            self.motion_error.is_finite() && self.motion_error > 0.0,
+            "scene.motion_error",
+            &self.motion_error,
+            "is not a distance",
+            "give a distance in metres above 0, for example 0.01",
+        )?;
+        require(
+            !empty(&self.particles),
+            "scene.particles",
+            &self.particles,
+            "holds an empty path",
+            "remove it, or write [] when there are no particles",
         )
     }
 }
@@ -578,6 +664,13 @@ impl TaskConfig {
             &self.cells_per_task,
             "is out of range",
             "use 1 to 65536; 16 suit most scenes",
+        )?;
+        require(
+            fits(self.states_per_task),
+            "tasks.states_per_task",
+            &self.states_per_task,
+            "is out of range",
+            "use 1 to 65536; 32 suit most scenes",
         )
     }
 }
@@ -739,7 +832,8 @@ mod tests {
             .iter()
             .flat_map(|(s, keys)| keys.as_object().unwrap().keys().map(move |k| format!("{s}.{k}")))
             .collect();
-        in_struct.push("region.ground_from".into());
+        // Absent by default.
+        in_struct.extend(["region.ground_from".into(), "scene.animation".into()]);
         let mut documented: Vec<String> = KEYS.iter().map(|k| k.key.to_owned()).collect();
         in_struct.sort();
         documented.sort();
@@ -784,6 +878,7 @@ mod tests {
             ("heights = \"sea\"\n", "region.heights"),
             ("eye_height = [1.0]\n", "region.eye_height"),
             ("[tasks]\ncells_per_task = 1.5\n", "tasks.cells_per_task"),
+            ("[scene]\nanimation = -1\n", "scene.animation"),
         ] {
             match from(rest) {
                 Err(ConfigError::WrongType { key, .. }) => assert_eq!(key, wanted),
@@ -808,6 +903,10 @@ mod tests {
             ("[accuracy]\nrounds = 2000\n", "accuracy.rounds"),
             ("[solver]\nrows = 600\n", "solver.rows_max"),
             ("[tasks]\nsegments_per_task = 0\n", "tasks.segments_per_task"),
+            ("[tasks]\nstates_per_task = 0\n", "tasks.states_per_task"),
+            ("[scene]\nmotion_error = 0.0\n", "scene.motion_error"),
+            ("[scene]\nanimation = \"\"\n", "scene.animation"),
+            ("[scene]\nparticles = [\"\"]\n", "scene.particles"),
         ] {
             match from(rest) {
                 Err(error @ ConfigError::Invalid { key, .. }) => {
@@ -822,9 +921,23 @@ mod tests {
     #[test]
     fn the_hash_covers_all_but_the_cutting_into_tasks() {
         let base = from("").unwrap();
-        assert_eq!(base.hash(), from("[tasks]\ncells_per_task = 3\n").unwrap().hash());
+        for cut in ["cells_per_task = 3", "states_per_task = 1"] {
+            assert_eq!(base.hash(), from(&format!("[tasks]\n{cut}\n")).unwrap().hash());
+        }
+        for motion in ["motion_error = 0.1", "animation = \"none\"", "particles = [\"a.pts\"]"] {
+            assert_ne!(base.hash(), from(&format!("[scene]\n{motion}\n")).unwrap().hash());
+        }
         assert_ne!(base.hash(), from("[solver]\nrows = 104\n").unwrap().hash());
         assert_ne!(base.hash(), from("ground_from = 5.0\n").unwrap().hash());
+    }
+
+    #[test]
+    fn an_animation_has_a_name_or_a_number() {
+        let animation = |value: &str| from(&format!("[scene]\nanimation = {value}\n")).unwrap();
+        let (one, other) = (animation("3"), animation("\"3\""));
+        assert_eq!((&one, one.scene.animation.as_deref()), (&other, Some("3")));
+        assert_eq!(BakeConfig::from_toml(&one.to_toml()).unwrap(), one);
+        assert_eq!(animation("\"walk\"").scene.animation.as_deref(), Some("walk"));
     }
 
     #[test]

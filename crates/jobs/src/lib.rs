@@ -15,8 +15,8 @@ pub mod status;
 
 pub use config::{AccuracyConfig, BakeConfig, ConfigError, Heights, KEYS, KeyDoc};
 pub use plan::{
-    FORMAT_VERSION, Plan, PlannedCell, SceneFile, SceneRef, SkippedCells, Task, TaskId, TaskKind,
-    TiledCell, plan,
+    FORMAT_VERSION, Plan, PlannedCell, SceneFile, SceneRef, SkippedCells, StateRange, Task, TaskId,
+    TaskKind, TiledCell, plan,
 };
 pub use schedule::{
     FailureClass, Lease, LeaseId, Missing, Outcome, Progress, SchedulePolicy, Scheduler, TaskState,

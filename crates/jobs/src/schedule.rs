@@ -574,7 +574,9 @@ mod tests {
     use sightline_geometry::{CellId, SegmentId};
 
     use super::*;
-    use crate::TaskKind;
+    use crate::{StateRange, TaskKind};
+
+    const STATES: StateRange = StateRange { first: 0, end: 1 };
 
     const POLICY: SchedulePolicy = SchedulePolicy {
         lease_ms: 100,
@@ -588,14 +590,14 @@ mod tests {
     fn tasks(leaves: u32, cells: u32) -> Vec<Task> {
         let segments = (0..leaves).map(|k| Task {
             id: TaskId(k),
-            kind: TaskKind::Segments { first: SegmentId(k), end: SegmentId(k + 1) },
+            kind: TaskKind::Segments { first: SegmentId(k), end: SegmentId(k + 1), states: STATES },
             depends_on: vec![],
         });
         let cells = (0..cells).map(|k| {
             let on: BTreeSet<TaskId> = [TaskId(k % leaves), TaskId((k + 1) % leaves)].into();
             Task {
                 id: TaskId(leaves + k),
-                kind: TaskKind::Cells { first: CellId(k), end: CellId(k + 1) },
+                kind: TaskKind::Cells { first: CellId(k), end: CellId(k + 1), states: STATES },
                 depends_on: on.into_iter().collect(),
             }
         });

@@ -79,10 +79,12 @@ pub struct BakeStatus {
     pub phase: Phase,
     /// Tasks by state.
     pub tasks: Progress,
-    /// Cells.
+    /// Cells, once a range of states.
     pub cells: Done,
-    /// Segments.
+    /// Segments, once a range of states.
     pub segments: Done,
+    /// Cells whose ranges of states are joined; none in all where there is one range.
+    pub joins: Done,
     /// Tasks that were committed before this coordinator started.
     pub tasks_resumed: u32,
     /// Workers at hand.
@@ -99,10 +101,18 @@ pub struct BakeStatus {
     pub merge_ms: u64,
     /// Sum over reported tasks of the time workers spent in computing, ms.
     pub worker_solve_ms: u64,
-    /// Segments and cells finished a second, averaged over phase `Solving`.
+    /// Segments, cells and joins finished a second, averaged over phase `Solving`.
     pub units_per_second: f64,
     /// Number of the published manifest; 0 before it is.
     pub manifest: u64,
     /// Why the bake failed; empty otherwise.
     pub error: String,
+}
+
+impl BakeStatus {
+    /// Cells of the dataset, each once.
+    #[must_use]
+    pub const fn dataset_cells(&self) -> u64 {
+        if self.joins.total > 0 { self.joins.total } else { self.cells.total }
+    }
 }

@@ -8,6 +8,9 @@
 //! - a see-through primitive nearer than d is not in the set, and no see-through primitive of
 //!   the set is at the same depth.
 //!
+//! Where something moves, a ray is cast at a moment, and *the set* is that of the moment's state. The
+//! error of a cell is then the mean over its viewpoints and the time of the states that are measured.
+//!
 //! *Same depth* and *farther* are meant up to a bound that is derived in `depth_tie`: a tie of
 //! coplanar primitives is no error.
 //!
@@ -27,10 +30,10 @@ mod sequential;
 
 pub use depth_tie::ties;
 pub use measure::{
-    CellError, ViewpointError, measure_cell, measure_viewpoint, measure_viewpoints,
-    random_viewpoints,
+    CellError, ViewpointError, measure_cell, measure_cell_over, measure_viewpoint,
+    measure_viewpoint_at, measure_viewpoints_at, random_viewpoints,
 };
-pub use membership::Members;
-pub use scattered::{SCATTERED_BATCH, measure_scattered};
+pub use membership::{Members, StateMembers};
+pub use scattered::{SCATTERED_BATCH, Suspect, measure_scattered, measure_scattered_over};
 pub use seed::{SplitMix64, viewpoint_seed};
 pub use sequential::{ErrorTest, Verdict};

@@ -7,12 +7,15 @@
 use glam::DVec3;
 use rayon::prelude::*;
 use sightline_geometry::raycast::{Hit, Ray, RayCaster};
-use sightline_geometry::{CellId, InstancedGeometry, PrimitiveSet, ViewCell};
+use sightline_geometry::{
+    CellId, InstancedGeometry, Moment, PrimitiveSet, StateSets, Timeline, ViewCell,
+};
 
 use crate::depth_tie::ties;
 use crate::directions::Lattice;
-use crate::membership::Members;
-use crate::seed::{SplitMix64, batch_seed, placement_seed, viewpoint_seed};
+use crate::membership::StateMembers;
+use crate::scattered::Suspect;
+use crate::seed::{SplitMix64, batch_seed, moment_seed, placement_seed, viewpoint_seed};
 
 /// Rays of one piece of work: a few milliseconds.
 const CHUNK: usize = 4096;
@@ -26,6 +29,8 @@ const LATTICE_MAX: u32 = 1 << 20;
 pub struct ViewpointError {
     /// Where the rays start, world space, metres.
     pub viewpoint: DVec3,
+    /// When they are cast.
+    pub moment: Moment,
     /// Rays traced.
     pub rays: u32,
     /// Rays whose picture of the set is wrong.
@@ -66,7 +71,7 @@ impl CellError {
     }
 }
 
-/// Measures `set` at one viewpoint with `rays` directions given by `seed`.
+/// Measures `set` at one viewpoint of a scene at rest with `rays` directions given by `seed`.
 ///
 /// # Panics
 /// When the set has a member that the geometry lacks.
@@ -78,10 +83,26 @@ pub fn measure_viewpoint(
     rays: u32,
     seed: u64,
 ) -> ViewpointError {
-    measure(geometry, set, &[(viewpoint, seed)], rays)[0]
+    let at = Suspect { viewpoint, moment: Moment::START };
+    measure_viewpoint_at(geometry, &StateSets::constant(0..1, set.clone()), at, rays, seed)
 }
 
-/// Measures `set` at `viewpoints` random viewpoints, uniform in the cell.
+/// Measures `sets` at one viewpoint and moment with `rays` directions given by `seed`.
+///
+/// # Panics
+/// When a set has a member that the geometry lacks, or the moment's state is not covered.
+#[must_use]
+pub fn measure_viewpoint_at(
+    geometry: &InstancedGeometry,
+    sets: &StateSets,
+    at: Suspect,
+    rays: u32,
+    seed: u64,
+) -> ViewpointError {
+    measure(geometry, sets, &[(at, seed)], rays)[0]
+}
+
+/// Measures `set` at `viewpoints` random viewpoints, uniform in the cell, of a scene at rest.
 ///
 /// # Panics
 /// When the set has a member that the geometry lacks.
@@ -94,27 +115,54 @@ pub fn measure_cell(
     rays: u32,
     seed: u64,
 ) -> CellError {
-    let viewpoints = random_viewpoints(cell, viewpoints, seed);
-    measure_viewpoints(geometry, set, cell.id, &viewpoints, rays, seed)
+    let sets = StateSets::constant(0..1, set.clone());
+    measure_cell_over(geometry, &sets, &Timeline::at_rest(), cell, viewpoints, rays, seed)
 }
 
-/// Measures `set` at given viewpoints of a cell; the directions at viewpoint i are given by
-/// [`viewpoint_seed`]`(seed, cell, i)`.
+/// Measures `sets` at `viewpoints` random viewpoints, uniform in the cell, each at a random moment,
+/// uniform over the time of the states.
 ///
 /// # Panics
-/// When the set has a member that the geometry lacks.
+/// When a set has a member that the geometry lacks, or the timeline lacks a state.
 #[must_use]
-pub fn measure_viewpoints(
+pub fn measure_cell_over(
     geometry: &InstancedGeometry,
-    set: &PrimitiveSet,
-    cell: CellId,
-    viewpoints: &[DVec3],
+    sets: &StateSets,
+    timeline: &Timeline,
+    cell: &ViewCell,
+    viewpoints: u32,
     rays: u32,
     seed: u64,
 ) -> CellError {
-    let seeded: Vec<(DVec3, u64)> =
-        (0..).zip(viewpoints).map(|(i, &v)| (v, viewpoint_seed(seed, cell, i))).collect();
-    CellError { cell, viewpoints: measure(geometry, set, &seeded, rays) }
+    let states = sets.states();
+    let mut clock = SplitMix64::new(moment_seed(seed, cell.id));
+    let at: Vec<Suspect> = random_viewpoints(cell, viewpoints, seed)
+        .into_iter()
+        .map(|viewpoint| {
+            let moment = timeline.moment(&states, clock.next_unit());
+            Suspect { viewpoint, moment }
+        })
+        .collect();
+    measure_viewpoints_at(geometry, sets, cell.id, &at, rays, seed)
+}
+
+/// Measures `sets` at given viewpoints and moments of a cell; the directions at number i are given by
+/// [`viewpoint_seed`]`(seed, cell, i)`.
+///
+/// # Panics
+/// When a set has a member that the geometry lacks, or a moment's state is not covered.
+#[must_use]
+pub fn measure_viewpoints_at(
+    geometry: &InstancedGeometry,
+    sets: &StateSets,
+    cell: CellId,
+    at: &[Suspect],
+    rays: u32,
+    seed: u64,
+) -> CellError {
+    let seeded: Vec<(Suspect, u64)> =
+        (0..).zip(at).map(|(i, &at)| (at, viewpoint_seed(seed, cell, i))).collect();
+    CellError { cell, viewpoints: measure(geometry, sets, &seeded, rays) }
 }
 
 /// `count` viewpoints, uniform in the cell's footprint and height, given by seed and cell id.
@@ -154,11 +202,11 @@ impl Batches {
 
 fn measure(
     geometry: &InstancedGeometry,
-    set: &PrimitiveSet,
-    viewpoints: &[(DVec3, u64)],
+    sets: &StateSets,
+    viewpoints: &[(Suspect, u64)],
     rays: u32,
 ) -> Vec<ViewpointError> {
-    let members = Members::new(set, geometry.primitive_count());
+    let members = StateMembers::new(sets, geometry.primitive_count());
     let batches = Batches::new(rays);
     let pieces: Vec<(usize, u32, &Lattice, usize)> = (0..viewpoints.len())
         .flat_map(|v| batches.iter().map(move |(batch, lattice)| (v, batch, lattice)))
@@ -169,12 +217,13 @@ fn measure(
     let counts: Vec<(usize, u32)> = pieces
         .into_par_iter()
         .map_init(Tracer::default, |tracer, (v, batch, lattice, start)| {
-            let (origin, seed) = viewpoints[v];
+            let (at, seed) = viewpoints[v];
             let range = start..lattice.len().min(start + CHUNK);
             let wrong = lattice
                 .directions(batch_seed(seed, batch), range)
                 .filter(|&direction| {
-                    tracer.is_wrong(geometry, &members, Ray::new(origin, direction))
+                    let ray = Ray { origin: at.viewpoint, direction, moment: at.moment };
+                    tracer.is_wrong(geometry, &members, ray)
                 })
                 .count();
             (v, wrong as u32)
@@ -184,11 +233,19 @@ fn measure(
     for (v, count) in counts {
         wrong[v] += count;
     }
-    let errors = viewpoints.iter().zip(wrong).map(|(&(viewpoint, seed), wrong)| {
+    let errors = viewpoints.iter().zip(wrong).map(|(&(at, seed), wrong)| {
         let error = f64::from(wrong) / f64::from(rays.max(1));
-        ViewpointError { viewpoint, rays, wrong, error, seed }
+        let Suspect { viewpoint, moment } = at;
+        ViewpointError { viewpoint, moment, rays, wrong, error, seed }
     });
     errors.collect()
+}
+
+/// True when something can be seen and hides nothing.
+fn has_see_through(geometry: &InstancedGeometry) -> bool {
+    !geometry.see_through.instances.is_empty()
+        || !geometry.moving_see_through.instances.is_empty()
+        || geometry.particles.iter().any(|system| !system.occluder)
 }
 
 /// A ray caster and the see-through hits of the current ray.
@@ -204,27 +261,26 @@ impl Tracer {
     pub(crate) fn is_wrong(
         &mut self,
         geometry: &InstancedGeometry,
-        members: &Members,
+        members: &StateMembers<'_>,
         ray: Ray,
     ) -> bool {
+        let present = |p| members.contains(p, ray.moment.state);
         let nearest = self.caster.closest_occluder(geometry, ray, f64::INFINITY, |_| true);
         if let Some(hit) = nearest
-            && !members.contains(hit.primitive)
+            && !present(hit.primitive)
         {
-            let of_set =
-                self.caster.closest_occluder(geometry, ray, f64::INFINITY, |p| members.contains(p));
+            let of_set = self.caster.closest_occluder(geometry, ray, f64::INFINITY, present);
             if !of_set.is_some_and(|other| ties(geometry, ray, hit, other)) {
                 return true;
             }
         }
-        !geometry.see_through.instances.is_empty()
-            && self.misses_see_through(geometry, members, ray, nearest)
+        has_see_through(geometry) && self.misses_see_through(geometry, members, ray, nearest)
     }
 
     fn misses_see_through(
         &mut self,
         geometry: &InstancedGeometry,
-        members: &Members,
+        members: &StateMembers<'_>,
         ray: Ray,
         nearest: Option<Hit>,
     ) -> bool {
@@ -233,7 +289,11 @@ impl Tracer {
         present.clear();
         let limit = nearest.map_or(f64::INFINITY, |hit| hit.distance);
         caster.see_through(geometry, ray, limit, |hit| {
-            if members.contains(hit.primitive) { present.push(hit) } else { missing.push(hit) }
+            if members.contains(hit.primitive, ray.moment.state) {
+                present.push(hit)
+            } else {
+                missing.push(hit)
+            }
         });
         // Nearest first, so that `ties` sees its arguments in order.
         missing.iter().any(|&gone| {

@@ -9,22 +9,26 @@
 //! The viewpoint of a wrong ray is a *suspect*: viewpoints are found in proportion to their error,
 //! so what stands in a pocket is found before what stands in the open.
 //!
+//! Where something moves, a ray is cast at a random moment, uniform over the time of the states that
+//! are measured: it is then wrong with a probability that is the mean error over cell and time.
+//!
 //! Directions of a batch are one spherical lattice, rotated and jittered at random, which spreads
 //! them more evenly than independent ones. Counts then vary less than those of independent rays
 //! with the same mean (Hoeffding, "On the Distribution of the Number of Successes in Independent
 //! Trials", 1956), so a test for independent rays errs on the safe side.
 
+use std::ops::Range;
 use std::sync::OnceLock;
 
 use glam::DVec3;
 use rayon::prelude::*;
 use sightline_geometry::raycast::Ray;
-use sightline_geometry::{InstancedGeometry, ViewCell};
+use sightline_geometry::{InstancedGeometry, Moment, PrimitiveSet, StateSets, Timeline, ViewCell};
 
 use crate::directions::Lattice;
 use crate::measure::Tracer;
-use crate::membership::Members;
-use crate::seed::{SplitMix64, placement_seed, viewpoint_seed};
+use crate::membership::StateMembers;
+use crate::seed::{SplitMix64, moment_seed, placement_seed, viewpoint_seed};
 
 /// Rays of a batch: enough for a bad cell to show, a fifth of what a good one takes at a target of
 /// 0.02 %.
@@ -33,35 +37,71 @@ pub const SCATTERED_BATCH: u32 = 4096;
 /// Rays of one piece of work.
 const CHUNK: usize = 1024;
 
-/// Casts batch number `batch` of a measurement: [`SCATTERED_BATCH`] rays. Gives the viewpoints of
-/// those that are wrong, in a fixed order.
+/// Where and when a ray was wrong.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Suspect {
+    /// Where it started, world space, metres.
+    pub viewpoint: DVec3,
+    /// When it was cast.
+    pub moment: Moment,
+}
+
+/// Casts batch number `batch` of a measurement in a scene at rest: [`SCATTERED_BATCH`] rays. Gives the
+/// viewpoints of those that are wrong, in a fixed order.
 ///
 /// # Panics
 /// When the set has a member that the geometry lacks.
 #[must_use]
 pub fn measure_scattered(
     geometry: &InstancedGeometry,
-    members: &Members,
+    set: &PrimitiveSet,
     cell: &ViewCell,
     batch: u32,
     seed: u64,
 ) -> Vec<DVec3> {
+    let sets = StateSets::constant(0..1, set.clone());
+    let members = StateMembers::new(&sets, geometry.primitive_count());
+    let timeline = Timeline::at_rest();
+    let wrong = measure_scattered_over(geometry, &members, &timeline, cell, batch, seed);
+    wrong.into_iter().map(|suspect| suspect.viewpoint).collect()
+}
+
+/// Casts batch number `batch` of a measurement over the states of `members`: [`SCATTERED_BATCH`] rays,
+/// at random moments. Gives those that are wrong, in a fixed order.
+///
+/// # Panics
+/// When a set has a member that the geometry lacks, or the timeline lacks a state.
+#[must_use]
+pub fn measure_scattered_over(
+    geometry: &InstancedGeometry,
+    members: &StateMembers<'_>,
+    timeline: &Timeline,
+    cell: &ViewCell,
+    batch: u32,
+    seed: u64,
+) -> Vec<Suspect> {
     static LATTICE: OnceLock<Lattice> = OnceLock::new();
     let lattice = LATTICE.get_or_init(|| Lattice::new(SCATTERED_BATCH));
     let directions = viewpoint_seed(seed, cell.id, batch);
     let places = placement_seed(directions, cell.id);
+    let times = moment_seed(directions, cell.id);
+    let states: Range<u32> = members.sets().states();
     let starts: Vec<usize> = (0..lattice.len()).step_by(CHUNK).collect();
-    let wrong: Vec<Vec<DVec3>> = starts
+    let wrong: Vec<Vec<Suspect>> = starts
         .into_par_iter()
         .map_init(Tracer::default, |tracer, start| {
             let range = start..lattice.len().min(start + CHUNK);
-            // Three numbers a viewpoint.
+            // Three numbers a viewpoint, and one a moment.
             let mut random = SplitMix64::at(places, 3 * start as u64);
+            let mut clock = SplitMix64::at(times, start as u64);
             let rays = lattice.directions(directions, range).map(|direction| {
                 let (u, v, h) = (random.next_unit(), random.next_unit(), random.next_unit());
-                Ray::new(cell.viewpoint(u, v, h), direction)
+                let moment = timeline.moment(&states, clock.next_unit());
+                Ray { origin: cell.viewpoint(u, v, h), direction, moment }
             });
-            rays.filter(|&ray| tracer.is_wrong(geometry, members, ray)).map(|r| r.origin).collect()
+            rays.filter(|&ray| tracer.is_wrong(geometry, members, ray))
+                .map(|ray| Suspect { viewpoint: ray.origin, moment: ray.moment })
+                .collect()
         })
         .collect();
     wrong.concat()

@@ -39,6 +39,12 @@ pub(crate) const fn batch_seed(seed: u64, batch: u32) -> u64 {
     absorb(seed, (2 << 32) | batch as u64)
 }
 
+/// The seed of the moments at which rays or viewpoints are looked at. Apart from the other two, so
+/// that a scene that moves has the viewpoints and directions of one at rest.
+pub(crate) const fn moment_seed(seed: u64, cell: CellId) -> u64 {
+    absorb(absorb(seed, cell.0 as u64), 3 << 32)
+}
+
 /// A small generator of 64 random bits a step, period 2^64.
 #[derive(Clone, Debug)]
 pub struct SplitMix64(u64);
@@ -86,6 +92,7 @@ mod tests {
         let mut seen = std::collections::HashSet::new();
         for cell in 0..50 {
             assert!(seen.insert(placement_seed(7, CellId(cell))));
+            assert!(seen.insert(moment_seed(7, CellId(cell))));
             for viewpoint in 0..50 {
                 assert!(seen.insert(viewpoint_seed(7, CellId(cell), viewpoint)));
             }

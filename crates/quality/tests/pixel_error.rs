@@ -2,12 +2,13 @@
 
 use glam::{DAffine3, DVec3};
 use sightline_geometry::{
-    CellId, Instance, InstancedGeometry, Mesh, MeshId, ObjectId, PrimitiveId, PrimitiveSet,
-    ViewCell,
+    CellId, Instance, InstancedGeometry, Mesh, MeshId, Moment, ObjectId, ParticleSystem,
+    PrimitiveId, PrimitiveSet, Sphere, StateSets, Timeline, ViewCell,
 };
 use sightline_quality::{
-    Members, SCATTERED_BATCH, measure_cell, measure_scattered, measure_viewpoint,
-    random_viewpoints, viewpoint_seed,
+    SCATTERED_BATCH, StateMembers, Suspect, measure_cell, measure_cell_over, measure_scattered,
+    measure_scattered_over, measure_viewpoint, measure_viewpoint_at, random_viewpoints,
+    viewpoint_seed,
 };
 
 const RAYS: u32 = 200_000;
@@ -216,9 +217,8 @@ fn single_rays_measure_the_mean_error_of_the_cell() {
     let scene = geometry(vec![room(5.0, DVec3::ZERO), panel(DVec3::ZERO, true)]);
     let set = all_but(&scene, &[12]);
     let expected = measure_cell(&scene, &set, &cell(), 200, 2000, 1).mean();
-    let members = Members::new(&set, scene.primitive_count());
     let scattered = |seed| -> Vec<DVec3> {
-        (0..20).flat_map(|b| measure_scattered(&scene, &members, &cell(), b, seed)).collect()
+        (0..20).flat_map(|b| measure_scattered(&scene, &set, &cell(), b, seed)).collect()
     };
     let wrong = scattered(1);
     let rays = f64::from(20 * SCATTERED_BATCH);
@@ -231,6 +231,123 @@ fn single_rays_measure_the_mean_error_of_the_cell() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         assert_eq!(pool.install(|| scattered(1)), wrong, "the same on {threads} threads");
     }
-    let all = Members::new(&all_but(&scene, &[]), scene.primitive_count());
+    let all = all_but(&scene, &[]);
     assert!(measure_scattered(&scene, &all, &cell(), 0, 1).is_empty());
+}
+
+/// A room with a panel that is there, see-through or not, and moves behind the far wall in the second
+/// of three states.
+fn leaving(occluder: bool) -> InstancedGeometry {
+    let still = geometry(vec![room(5.0, DVec3::ZERO), panel(DVec3::ZERO, occluder)]);
+    let mut instances = still.instances;
+    let at = |z: f64| DAffine3::from_translation(DVec3::new(0.0, 0.0, z));
+    instances[1].motion = Some(Box::new([at(0.0), at(0.0), at(-9.0), at(-9.0)]));
+    InstancedGeometry::with_motion(still.meshes, instances, vec![], 3)
+}
+
+fn clock() -> Timeline {
+    Timeline::new(vec![0.0, 1.0, 2.0, 4.0]).unwrap()
+}
+
+/// The room alone in `states`, the panel with it in the others.
+fn without_panel(scene: &InstancedGeometry, states: std::ops::Range<u32>) -> StateSets {
+    let (all, room) = (all_but(scene, &[]), all_but(scene, &[12]));
+    StateSets::from_runs(
+        (0..3).map(|k| (k..k + 1, if states.contains(&k) { room.clone() } else { all.clone() })),
+    )
+}
+
+#[test]
+fn the_set_of_the_moment_counts() {
+    for occluder in [true, false] {
+        let scene = leaving(occluder);
+        let expected = share(TRIANGLE.map(|p| DVec3::from_array(p.map(f64::from))));
+        let error = |sets: &StateSets, state, t| {
+            let at = Suspect { viewpoint: DVec3::ZERO, moment: Moment { state, t } };
+            measure_viewpoint_at(&scene, sets, at, RAYS, 3).error
+        };
+        let missing = without_panel(&scene, 0..3);
+        assert!((error(&missing, 0, 0.5) - expected).abs() < spread(expected));
+        assert!((error(&missing, 1, 0.0) - expected).abs() < spread(expected));
+        assert!(error(&missing, 1, 0.1) < 0.9 * expected, "it moves away");
+        assert_eq!(error(&missing, 1, 0.9), 0.0, "it is behind the wall");
+        assert_eq!(error(&missing, 2, 0.5), 0.0);
+        // It is enough to have it where it is seen.
+        let right = without_panel(&scene, 2..3);
+        assert!([(0, 0.5), (1, 0.1), (2, 0.5)].iter().all(|&(k, t)| error(&right, k, t) == 0.0));
+    }
+}
+
+#[test]
+fn random_moments_are_uniform_over_time() {
+    let scene = leaving(true);
+    let cell = cell();
+    let sets = without_panel(&scene, 0..3);
+    let members = StateMembers::new(&sets, scene.primitive_count());
+    let over = |sets: &StateSets, seed| -> Vec<Suspect> {
+        let members = StateMembers::new(sets, scene.primitive_count());
+        (0..20)
+            .flat_map(|b| measure_scattered_over(&scene, &members, &clock(), &cell, b, seed))
+            .collect()
+    };
+    let wrong = over(&sets, 1);
+    assert!(wrong.iter().all(|w| w.moment.state < 2 && cell.contains(w.viewpoint)));
+    let first = wrong.iter().filter(|w| w.moment.state == 0).count() as f64;
+    // The first state takes a quarter of the time.
+    let alone = over(&sets.within(0..1), 1).len() as f64;
+    assert!((first - alone / 4.0).abs() < 5.0 * first.sqrt(), "{first} {alone}");
+    let late = sets.within(2..3);
+    assert!(over(&late, 1).is_empty());
+    for threads in [1, 3] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let again =
+            pool.install(|| measure_scattered_over(&scene, &members, &clock(), &cell, 0, 1));
+        assert_eq!(again, wrong[..again.len()], "the same on {threads} threads");
+    }
+    let full = measure_cell_over(&scene, &sets, &clock(), &cell, 50, 1000, 1);
+    let states: std::collections::BTreeSet<u32> =
+        full.viewpoints.iter().map(|v| v.moment.state).collect();
+    assert_eq!(states.len(), 3, "viewpoints are looked at at moments of all states");
+    assert!(full.viewpoints.iter().all(|v| v.moment.state < 2 || v.wrong == 0));
+    let worst = full.worst().unwrap();
+    let at = Suspect { viewpoint: worst.viewpoint, moment: worst.moment };
+    assert_eq!(measure_viewpoint_at(&scene, &sets, at, 1000, worst.seed), *worst);
+}
+
+#[test]
+fn viewpoints_and_directions_do_not_depend_on_whether_something_moves() {
+    let scene = geometry(vec![room(5.0, DVec3::ZERO), panel(DVec3::ZERO, true)]);
+    let set = all_but(&scene, &[12]);
+    let still = measure_scattered(&scene, &set, &cell(), 0, 4);
+    let sets = StateSets::constant(0..3, set.clone());
+    let members = StateMembers::new(&sets, scene.primitive_count());
+    let moving = measure_scattered_over(&scene, &members, &clock(), &cell(), 0, 4);
+    assert!(moving.iter().map(|s| s.viewpoint).eq(still));
+    assert!(moving.windows(2).any(|w| w[0].moment.state != w[1].moment.state));
+    let still = measure_cell(&scene, &set, &cell(), 5, 1000, 11);
+    let moving = measure_cell_over(&scene, &sets, &clock(), &cell(), 5, 1000, 11);
+    let wrong =
+        |e: &sightline_quality::CellError| e.viewpoints.iter().map(|v| v.wrong).collect::<Vec<_>>();
+    assert_eq!(wrong(&still), wrong(&moving));
+}
+
+#[test]
+fn missing_particles_are_found() {
+    for occluder in [true, false] {
+        let still = geometry(vec![room(5.0, DVec3::ZERO)]);
+        let sphere = vec![Sphere { center: [0.0, 0.0, -2.0], radius: 1.0 }];
+        let keys = vec![sphere.clone(), sphere, vec![Sphere::ABSENT]];
+        let (object, first) = (ObjectId(1), PrimitiveId(12));
+        let (system, _) = ParticleSystem::new(object, first, occluder, DVec3::ZERO, keys);
+        let scene = InstancedGeometry::with_motion(still.meshes, still.instances, vec![system], 2);
+        let sets = StateSets::constant(0..2, all_but(&scene, &[12]));
+        let error = |state| {
+            let at = Suspect { viewpoint: DVec3::ZERO, moment: Moment { state, t: 0.5 } };
+            measure_viewpoint_at(&scene, &sets, at, RAYS, 3).error
+        };
+        // A ball of radius 1 at distance 2: a cap of half-angle 30 degrees.
+        let expected = (1.0 - 0.75f64.sqrt()) / 2.0;
+        assert!((error(0) - expected).abs() < spread(expected), "{} {expected}", error(0));
+        assert_eq!(error(1), 0.0, "it is gone");
+    }
 }

@@ -1,22 +1,24 @@
 //! What a scene is made of, as hashes: two scenes with the same digest hold the same bytes.
 //!
 //! The digest covers the main file and every external buffer, in the order of `buffers`, each
-//! once. Images are left out: they do not change geometry. Buffers that are marked as the
+//! once, and then every particle table, in the order of the options, under its file name without
+//! folders. Images are left out: they do not change geometry. Buffers that are marked as the
 //! fallback of a compression extension count when their file is there.
 //!
 //! `combined` is the BLAKE3 hash over, for each file, the length of its name (8 bytes, little
 //! endian), its name, its size (8 bytes, little endian) and its BLAKE3 hash (32 bytes).
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::{SceneError, gltf_reader};
+use crate::{SceneError, gltf_reader, particles};
 
 /// Hash of one file of a scene.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileDigest {
-    /// Path relative to the folder of the main file, `/` between its parts.
+    /// Path relative to the folder of the main file, `/` between its parts; the name alone for
+    /// particle tables.
     pub name: String,
     /// Size in bytes.
     pub size: u64,
@@ -55,5 +57,19 @@ impl SceneDigest {
 /// # Errors
 /// When the main file or an external buffer cannot be read or the JSON is invalid.
 pub fn digest(path: &Path) -> Result<SceneDigest, SceneError> {
-    gltf_reader::digest(path).map_err(|e| e.in_file(path))
+    digest_with(path, &[])
+}
+
+/// As [`digest`], for a scene that is opened with the particle tables `tables` added.
+///
+/// # Errors
+/// As [`digest`]; when a table cannot be read.
+pub fn digest_with(path: &Path, tables: &[PathBuf]) -> Result<SceneDigest, SceneError> {
+    let mut files = if particles::is_table(path) {
+        particles::files(&[path.to_path_buf()])?
+    } else {
+        gltf_reader::files(path).map_err(|e| e.in_file(path))?
+    };
+    files.extend(particles::files(tables)?);
+    Ok(SceneDigest::of_files(files))
 }

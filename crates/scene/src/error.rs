@@ -10,10 +10,12 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use crate::particles::TableProblem;
+
 /// A scene that was refused.
 #[derive(Debug)]
 pub struct SceneError {
-    /// The main file of the scene.
+    /// The main file of the scene, or the particle table.
     pub file: PathBuf,
     /// The part of the scene that was being read.
     pub place: Place,
@@ -30,6 +32,14 @@ pub struct Place {
     pub mesh: Option<u32>,
     /// Index into the mesh's `primitives`.
     pub primitive: Option<u32>,
+    /// Index into `skins`.
+    pub skin: Option<u32>,
+    /// Index into `animations`.
+    pub animation: Option<u32>,
+    /// Index into the animation's `channels`.
+    pub channel: Option<u32>,
+    /// Index into the animation's `samplers`.
+    pub sampler: Option<u32>,
 }
 
 /// What is wrong with a scene. Byte ranges are half open.
@@ -53,6 +63,10 @@ pub enum Cause {
         /// What the pattern parser says.
         reason: String,
     },
+
+    /// A particle table is refused.
+    #[error(transparent)]
+    Table(#[from] TableProblem),
 
     /// A GLB file ends before the length that it states.
     #[error("the GLB container is cut short: {what} needs {needed} bytes, {available} are there")]
@@ -345,10 +359,140 @@ pub enum Cause {
         limit: f64,
     },
 
+    /// The options ask for an animation that the file does not have.
+    #[error("there is no animation {wanted}; the file has {}", list(names))]
+    NoSuchAnimation {
+        /// Index, or name in quotation marks.
+        wanted: String,
+        /// Names of those in the file; `#` and the index for those without.
+        names: Vec<String>,
+    },
+    /// The JSON of an animation or a skin is not what glTF defines.
+    #[error("its JSON is malformed: {reason}")]
+    PartMalformed {
+        /// What is wrong.
+        reason: String,
+    },
+    /// Two channels that play at the same time move the same property.
+    #[error("`{path}` of node {node} is moved by {first} and by {second}")]
+    AnimationConflict {
+        /// Index into `nodes`.
+        node: u32,
+        /// The property.
+        path: &'static str,
+        /// Animation and channel.
+        first: String,
+        /// Animation and channel.
+        second: String,
+    },
+    /// A channel moves the translation, rotation or scale of a node that has a matrix.
+    #[error("node {node} has a matrix, of which `{path}` cannot be moved")]
+    AnimatedMatrix {
+        /// Index into `nodes`.
+        node: u32,
+        /// The property.
+        path: &'static str,
+    },
+    /// Times of keys do not ascend, are negative or are not finite.
+    #[error(
+        "key {at} is at {time} s (accessor {accessor}); times must be finite, at least 0, and ascend"
+    )]
+    KeyTime {
+        /// Index into `accessors`.
+        accessor: u32,
+        /// Number of the key.
+        at: u64,
+        /// Its time, seconds.
+        time: f32,
+    },
+    /// A sampler has no keys.
+    #[error("it has no keys (accessor {accessor})")]
+    NoKeys {
+        /// Index into `accessors`.
+        accessor: u32,
+    },
+    /// A value of a sampler is not finite, or a rotation of length zero.
+    #[error("value {at} of accessor {accessor} is not finite, or a rotation of length zero")]
+    KeyValue {
+        /// Index into `accessors`.
+        accessor: u32,
+        /// Number of the element.
+        at: u64,
+    },
+    /// A joint of a skin is not in the scene.
+    #[error("joint {joint} is node {node}, which is not in the scene")]
+    JointNotInScene {
+        /// Number of the joint in the skin.
+        joint: u64,
+        /// Index into `nodes`.
+        node: u32,
+    },
+    /// A vertex follows a joint that the skin does not have, or with a weight that is none.
+    #[error(
+        "vertex {vertex} follows joint {joint} with weight {weight}; there are {joints} joints"
+    )]
+    VertexJoint {
+        /// Index of the vertex in the primitive.
+        vertex: u32,
+        /// Number of the joint.
+        joint: u32,
+        /// Its weight.
+        weight: f32,
+        /// Joints of the skin.
+        joints: u64,
+    },
+    /// The motion error of the options is not above 0.
+    #[error("a motion error of {error} m cannot be kept")]
+    MotionError {
+        /// The option, metres.
+        error: f64,
+    },
+    /// The motion needs more states than the options allow.
+    #[error(
+        "following the motion within {error} m takes more than {limit} states; they reach to \
+         {reached:.3} s of {duration:.3} s"
+    )]
+    TooManyStates {
+        /// Motion error of the options, metres.
+        error: f64,
+        /// The limit.
+        limit: u32,
+        /// Time that the states within the limit reach to, seconds.
+        reached: f64,
+        /// Duration of the animation, seconds.
+        duration: f64,
+    },
+    /// The motion bends so much that looking at it takes too long.
+    #[error("following the motion within {error} m takes more than {limit} samples of it")]
+    TooManySamples {
+        /// Motion error of the options, metres.
+        error: f64,
+        /// The limit.
+        limit: u64,
+    },
+    /// More positions of moving things than the options allow.
+    #[error(
+        "the scene has {count} positions of moving things at its key frames; the limit is {limit}"
+    )]
+    TooManyMovingPositions {
+        /// Positions, once a key frame.
+        count: u64,
+        /// The limit.
+        limit: u64,
+    },
+
     /// More triangles than primitive numbers.
     #[error("the scene has {count} triangles with its instances; the limit is {limit}")]
     TooManyTriangles {
         /// Triangles, instances counted.
+        count: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// More triangles and particles than primitive numbers.
+    #[error("the scene has {count} triangles and particles; the limit is {limit}")]
+    TooManyPrimitives {
+        /// Triangles, instances counted, and particles.
         count: u64,
         /// The limit.
         limit: u64,
@@ -409,10 +553,28 @@ impl fmt::Display for UriProblem {
     }
 }
 
+/// Names for a message, cut where they are many.
+fn list(names: &[String]) -> String {
+    const LISTED: usize = 16;
+    match names.len() {
+        0 => "none".into(),
+        n if n <= LISTED => names.join(", "),
+        n => format!("{} and {} more", names[..LISTED].join(", "), n - LISTED),
+    }
+}
+
 impl fmt::Display for Place {
     /// `node 3, mesh 2, primitive 0: `, or nothing.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let parts = [("node", self.node), ("mesh", self.mesh), ("primitive", self.primitive)];
+        let parts = [
+            ("node", self.node),
+            ("mesh", self.mesh),
+            ("primitive", self.primitive),
+            ("skin", self.skin),
+            ("animation", self.animation),
+            ("channel", self.channel),
+            ("sampler", self.sampler),
+        ];
         let known: Vec<String> =
             parts.iter().filter_map(|(name, index)| index.map(|i| format!("{name} {i}"))).collect();
         if known.is_empty() { Ok(()) } else { write!(f, "{}: ", known.join(", ")) }
@@ -437,9 +599,18 @@ impl From<Cause> for SceneError {
     }
 }
 
+impl From<TableProblem> for SceneError {
+    fn from(problem: TableProblem) -> Self {
+        Cause::from(problem).into()
+    }
+}
+
 impl SceneError {
+    /// Names the file, where none is named yet.
     pub(crate) fn in_file(mut self, file: &Path) -> Self {
-        self.file = file.to_path_buf();
+        if self.file.as_os_str().is_empty() {
+            self.file = file.to_path_buf();
+        }
         self
     }
 
@@ -454,13 +625,35 @@ impl SceneError {
         self
     }
 
+    pub(crate) fn at_skin(mut self, skin: u32) -> Self {
+        self.place.skin.get_or_insert(skin);
+        self
+    }
+
+    pub(crate) fn at_animation(mut self, animation: usize) -> Self {
+        self.place.animation.get_or_insert(animation as u32);
+        self
+    }
+
+    pub(crate) fn at_channel(mut self, channel: usize) -> Self {
+        self.place.channel.get_or_insert(channel as u32);
+        self
+    }
+
+    pub(crate) fn at_sampler(mut self, sampler: u32) -> Self {
+        self.place.sampler.get_or_insert(sampler);
+        self
+    }
+
     /// What to do about it, in one or two sentences; `None` when the message says it all.
     #[must_use]
     pub fn help(&self) -> Option<String> {
         let text = match &*self.cause {
             Cause::Read { .. } | Cause::NotAFile => {
-                "give the path of a .gltf or .glb file that this user can read".into()
+                "give the path of a .gltf, .glb, .parquet or .csv file that this user can read"
+                    .into()
             }
+            Cause::Table(problem) => problem.help().into(),
             Cause::Pattern { .. } => {
                 "patterns are globs: `*` and `**` match any text, `?` one character, `{a,b}` \
                  alternatives; write `[*]` for a literal star"
@@ -522,7 +715,7 @@ impl SceneError {
                     .into()
             }
             Cause::NodesTooDeep { .. } => "flatten the node hierarchy".into(),
-            Cause::TooManyTriangles { .. } => {
+            Cause::TooManyTriangles { .. } | Cause::TooManyPrimitives { .. } => {
                 "primitive numbers have 32 bits; split the world into several scenes".into()
             }
             Cause::TooManyUniqueTriangles { .. } | Cause::TooManyInstances { .. } => {
@@ -530,7 +723,43 @@ impl SceneError {
                  several scenes"
                     .into()
             }
-            Cause::ExtensionMalformed { .. }
+            Cause::NoSuchAnimation { .. } => {
+                "choose one of the file's animations by name or index, all of them, or none".into()
+            }
+            Cause::AnimationConflict { .. } => {
+                "choose one of the two animations instead of all, or export them as one".into()
+            }
+            Cause::AnimatedMatrix { .. } => {
+                "export the node with translation, rotation and scale instead of a matrix, or \
+                 choose another animation, or none"
+                    .into()
+            }
+            Cause::KeyTime { .. } | Cause::NoKeys { .. } | Cause::KeyValue { .. } => {
+                "repair the animation and export it again, or choose another one, or none".into()
+            }
+            Cause::JointNotInScene { .. } => {
+                "put the skeleton into the scene that shows the skinned mesh".into()
+            }
+            Cause::VertexJoint { .. } => {
+                "a vertex follows joints of its skin, with weights that are finite and not \
+                 negative; bind the mesh again and export it"
+                    .into()
+            }
+            Cause::MotionError { .. } => "give a finite number of metres above 0".into(),
+            Cause::TooManyStates { .. } => {
+                "raise the motion error or the limit of states, or choose a shorter animation"
+                    .into()
+            }
+            Cause::TooManySamples { .. } => {
+                "raise the motion error, or choose a shorter or a slower animation".into()
+            }
+            Cause::TooManyMovingPositions { .. } => {
+                "raise the motion error, which takes fewer key frames, or the limit if this \
+                 machine has the memory"
+                    .into()
+            }
+            Cause::PartMalformed { .. }
+            | Cause::ExtensionMalformed { .. }
             | Cause::NoSuch { .. }
             | Cause::InvalidValue { .. }
             | Cause::BufferWithoutData { .. }

@@ -3,11 +3,18 @@
 //! [`export_visible`] promises: the file holds the triangles of the set and no others, with their vertex
 //! attributes (in the component types of the source), materials, textures, names, hierarchy, extras,
 //! cameras and lights, in standard glTF 2.0 that passes the Khronos validator when the source does.
-//! External and data-URI images are embedded. The bytes depend on source and set alone.
+//! External and data-URI images are embedded. The bytes depend on source, set and moment alone.
 //!
-//! Left out: animations, skins (a skinned mesh stands where the reader saw it), morph targets
-//! (their weights at rest are applied to positions), other scenes than the default one, and what
-//! nothing visible refers to. Compressed data is written decompressed; strips and fans become lists.
+//! Particles of the set are instances of a tessellated sphere. A scene of particles alone is exported as
+//! these.
+//!
+//! The file is at rest: what an animation or a skin places is frozen at one moment, by default the first
+//! key frame. Such a mesh becomes a root with positions of its own, since between two key frames
+//! its transform need not be one that glTF can state. Cameras and lights stand where the nodes of
+//! the source put them.
+//!
+//! Left out: animations, skins and morph targets, once they are applied to positions; normals of
+//! what bends; other scenes than the default one, and what nothing visible refers to. Compressed data is written decompressed; strips and fans become lists.
 //! What is lost that way is a warning of the report.
 //!
 //! How a visible subset maps to meshes: the visible triangles of every instance of the geometry are a
@@ -16,11 +23,13 @@
 //! one child a distinct mesh, instanced where several instances share it.
 //!
 //! Parts: `source` reads raw elements; `output` collects sections, accessors and the GLB
-//! container; `subset` finds subsets and rebuilds primitives; `appearance` follows materials to images.
+//! container; `subset` finds subsets and rebuilds primitives, `frozen` those that move; `appearance` follows materials to images.
 
 mod appearance;
+mod frozen;
 mod hierarchy;
 mod output;
+mod particles;
 mod source;
 mod subset;
 
@@ -29,7 +38,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value, json};
-use sightline_geometry::PrimitiveSet;
+use sightline_geometry::{Moment, PrimitiveSet, Run};
 
 use crate::gltf_reader::{buffers, container, document, uri};
 use crate::{Scene, SceneError};
@@ -39,9 +48,12 @@ use source::Source;
 /// What was exported.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ExportReport {
-    /// Triangles of the exported scene, counted once for every instance: those of the set.
+    /// Triangles of the exported scene, counted once for every instance: those of the set. Without
+    /// those of particles.
     pub triangles: u64,
-    /// Triangles in the file.
+    /// Particles of the exported scene: those of the set that are there.
+    pub particles: u64,
+    /// Triangles in the file, without those of particles.
     pub unique_triangles: u64,
     /// Size of the file.
     pub bytes: u64,
@@ -55,6 +67,22 @@ pub struct ExportReport {
     pub images: usize,
     /// What was left out although it may matter, one sentence each.
     pub warnings: Vec<String>,
+}
+
+/// How a set is to be exported.
+#[derive(Clone, Copy, Debug, Default)]
+#[non_exhaustive]
+pub struct ExportOptions {
+    /// The moment at which what moves is frozen; the first key frame without one.
+    pub moment: Option<Moment>,
+}
+
+impl ExportOptions {
+    /// Freezes what moves at a moment of the scene, see [`Scene::moment_at`].
+    #[must_use]
+    pub fn at(moment: Moment) -> Self {
+        Self { moment: Some(moment) }
+    }
 }
 
 /// Why a set was not exported.
@@ -85,6 +113,16 @@ pub enum ExportError {
         primitive: u32,
         /// Primitives of the scene.
         count: u32,
+    },
+    /// The scene has no such moment.
+    #[error("the scene has {states} states, there is no moment {t} of state {state}")]
+    NoSuchMoment {
+        /// State of the moment.
+        state: u32,
+        /// Its share of the state.
+        t: f64,
+        /// States of the scene.
+        states: u32,
     },
     /// The output would replace the source: choose another path.
     #[error("{} is the source of the export", file.display())]
@@ -126,11 +164,15 @@ impl Warnings {
     }
 }
 
+/// The source of a scene that has no glTF file.
+const NO_TRIANGLES: &[u8] = br#"{ "asset": { "version": "2.0" }, "scene": 0, "scenes": [{}] }"#;
+
 /// Root extensions that refer to nothing which is renumbered.
 const ROOT_EXTENSIONS: [&str; 3] = ["KHR_lights_punctual", "KHR_xmp_json_ld", "KHR_xmp"];
 
 /// Writes the part of `scene` that is in `set` to `out`, a GLB file. `source` is the file that
-/// the scene was read from. `out` is replaced only when everything is written.
+/// the scene was read from. `out` is replaced only when everything is written. What moves stands as
+/// at the first key frame.
 ///
 /// # Errors
 /// See [`ExportError`].
@@ -140,6 +182,25 @@ pub fn export_visible(
     set: &PrimitiveSet,
     out: &Path,
 ) -> Result<ExportReport, ExportError> {
+    export_visible_with(source, scene, set, ExportOptions::default(), out)
+}
+
+/// As [`export_visible`], with options.
+///
+/// # Errors
+/// See [`ExportError`].
+pub fn export_visible_with(
+    source: &Path,
+    scene: &Scene,
+    set: &PrimitiveSet,
+    options: ExportOptions,
+    out: &Path,
+) -> Result<ExportReport, ExportError> {
+    let moment = options.moment.unwrap_or(Moment::START);
+    let states = scene.geometry.states;
+    if moment.state >= states || !(0.0..=1.0).contains(&moment.t) {
+        return Err(ExportError::NoSuchMoment { state: moment.state, t: moment.t, states });
+    }
     let count = scene.geometry.primitive_count();
     if let Some(last) = set.runs().last().filter(|r| r.end > count) {
         return Err(ExportError::NotThisScene { primitive: last.end - 1, count });
@@ -151,13 +212,21 @@ pub fn export_visible(
     }
     let in_source = |e: SceneError| ExportError::from(e.in_file(source));
     let malformed = |reason: String| ExportError::Malformed { file: source.into(), reason };
-    let main =
-        std::fs::read(source).map_err(|source| in_source(crate::Cause::Read { source }.into()))?;
+    // What is exported of a table is in the scene.
+    let is_table = crate::particles::is_table(source);
+    let main = if is_table {
+        NO_TRIANGLES.to_vec()
+    } else {
+        std::fs::read(source).map_err(|source| in_source(crate::Cause::Read { source }.into()))?
+    };
     let parts = container::split(&main).map_err(in_source)?;
     let document = document::Document::parse(parts.json).map_err(in_source)?;
     let buffers =
         buffers::Buffers::load(source, &main, parts.binary, &document).map_err(in_source)?;
-    if buffers.digest() != scene.digest {
+    // Behind the files of the source, the digest lists the particle tables.
+    let files = scene.digest.files.len() - scene.particles.len();
+    let own = crate::SceneDigest::of_files(buffers.files().to_vec());
+    if own.files[usize::from(is_table)..] != scene.digest.files[..files] {
         return Err(ExportError::SourceChanged { file: source.into() });
     }
     let read = Source::new(parts.json, &buffers).map_err(|e| malformed(e.to_string()))?;
@@ -165,9 +234,14 @@ pub fn export_visible(
     let mut output = Output::default();
     let mut warnings = Warnings::default();
     let placed = subset::placed(scene, set);
-    let mut meshes = subset::Meshes::new(&read, scene);
-    let nodes = hierarchy::build(&read, &placed, &mut meshes, &mut output, &mut warnings)
+    let mut meshes = subset::Meshes::new(&read, scene, moment);
+    let mut nodes = hierarchy::build(&read, &placed, &mut meshes, &mut output, &mut warnings)
         .ok_or_else(|| malformed("its nodes or meshes are not as they were read".into()))?;
+    let balls = particles::balls(scene, set, moment, meshes.json.len(), &mut output, &mut warnings)
+        .ok_or_else(|| malformed("its particles are not as they were read".into()))?;
+    nodes.roots.extend(nodes.json.len()..nodes.json.len() + balls.nodes.len());
+    nodes.json.extend(balls.nodes);
+    meshes.json.extend(balls.mesh);
     let mut root = Map::new();
     root.insert("asset".into(), asset(&read.json["asset"]));
     let mut shown = scene_of(&read.json);
@@ -180,7 +254,8 @@ pub fn export_visible(
     let mut mesh_json = meshes.json;
     let looks = appearance::collect(&read, source, &mut mesh_json, &mut output, &mut warnings);
     let report = ExportReport {
-        triangles: set.len(),
+        triangles: triangles_of(scene, set),
+        particles: balls.count,
         unique_triangles: meshes.triangles,
         bytes: 0,
         nodes: root.get("nodes").and_then(Value::as_array).map_or(0, Vec::len),
@@ -200,6 +275,13 @@ pub fn export_visible(
 
     let bytes = write(&root, &output, out)?;
     Ok(ExportReport { bytes, warnings: warnings.sentences(), ..report })
+}
+
+/// Number of triangles in a set of a scene.
+fn triangles_of(scene: &Scene, set: &PrimitiveSet) -> u64 {
+    let end = scene.geometry.triangle_count();
+    let below = |run: &Run| u64::from(run.end.min(end).saturating_sub(run.first));
+    set.runs().iter().map(below).sum()
 }
 
 fn insert_list(root: &mut Map<String, Value>, name: &str, list: Vec<Value>) {

@@ -1,8 +1,9 @@
-//! Scenes: glTF files to validated, numbered geometry.
+//! Scenes: glTF files and particle tables to validated, numbered geometry.
 //!
-//! [`Scene::open`] reads a `.gltf` or `.glb` file into [`sightline_geometry::InstancedGeometry`]
-//! with a primitive numbering that is a function of the file alone, or refuses it with a
-//! [`SceneError`] that names the cause. Memory follows unique triangles, not instances.
+//! [`Scene::open`] reads a `.gltf` or `.glb` file, or a table of particles (`.parquet`, `.csv`), into
+//! [`sightline_geometry::InstancedGeometry`] with a primitive numbering that is a function of the
+//! file alone, or refuses it with a [`SceneError`] that names the cause. Memory follows unique
+//! triangles, not instances, and particles times key frames.
 
 mod degenerate;
 mod digest;
@@ -11,12 +12,14 @@ pub mod export;
 pub mod generate;
 mod gltf_reader;
 mod numbering;
+pub mod particles;
 pub mod region;
 mod report;
 mod scene;
 
-pub use digest::{FileDigest, SceneDigest, digest};
+pub use digest::{FileDigest, SceneDigest, digest, digest_with};
 pub use error::{Cause, Place, SceneError, UriProblem};
 pub use numbering::morton;
-pub use report::{DegenerateTriangles, IngestReport, SkippedPrimitives};
-pub use scene::{InstanceSource, MeshSource, Object, OpenOptions, Scene};
+pub use particles::{ParticleSource, TableProblem};
+pub use report::{DegenerateTriangles, IgnoredChannels, IngestReport, SkippedPrimitives};
+pub use scene::{AnimationChoice, InstanceSource, MeshSource, Object, OpenOptions, Scene};

@@ -1,6 +1,7 @@
 //! What reading a scene found: counts, what was left out, and what deserves a look.
 
 use serde::Serialize;
+use sightline_geometry::ParticleSystem;
 
 /// Degenerate triangles that are listed for one glTF primitive; the count is complete.
 pub(crate) const LISTED_DEGENERATE_TRIANGLES: usize = 64;
@@ -29,6 +30,17 @@ pub struct SkippedPrimitives {
     pub without_positions: u64,
 }
 
+/// Channels of the animation that were not followed, for one reason.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct IgnoredChannels {
+    /// Why.
+    pub reason: String,
+    /// How many there are.
+    pub count: u64,
+    /// Which is the first: animation, channel and what it moves.
+    pub first: String,
+}
+
 /// What reading a scene found.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct IngestReport {
@@ -38,16 +50,20 @@ pub struct IngestReport {
     pub copyright: Option<String>,
     /// Triangles in memory, without degenerate ones.
     pub unique_triangles: u64,
-    /// Triangles with every instance counted: the number of primitives.
+    /// Triangles with every instance counted: the number of primitives but particles.
     pub instanced_triangles: u64,
     /// Vertices in memory: those that a triangle uses.
     pub unique_vertices: u64,
-    /// Objects: nodes with at least one triangle.
+    /// Objects: nodes with at least one triangle, and particle tables.
     pub objects: u64,
     /// Bodies of triangles in memory.
     pub meshes: u64,
     /// Placements of them.
     pub instances: u64,
+    /// Particles of all tables.
+    pub particles: u64,
+    /// Particles that hide nothing.
+    pub see_through_particles: u64,
     /// Instanced triangles that hide nothing.
     pub see_through_triangles: u64,
     /// Triangles of zero area that were dropped, in all meshes in memory.
@@ -58,11 +74,27 @@ pub struct IngestReport {
     pub skipped: SkippedPrimitives,
     /// Nodes with a mesh that are switched off by KHR_node_visibility, or lie below such a node.
     pub hidden_nodes: u64,
-    /// True when the file animates anything; the scene is read at rest.
+    /// True when the file animates anything, whether or not the scene is read in motion.
     pub animated: bool,
     /// Number of animations in the file.
     pub animations: u64,
-    /// Objects with a skin; they are read in the pose that the file stores.
+    /// Their names; `#` and the index for those without.
+    pub animation_names: Vec<String>,
+    /// Names of those that move the scene.
+    pub animations_taken: Vec<String>,
+    /// The time of their last key, seconds.
+    pub duration_s: f64,
+    /// Number of states: 1 at rest.
+    pub states: u64,
+    /// Objects with something that moves.
+    pub moving_objects: u64,
+    /// Instanced triangles that move.
+    pub moving_triangles: u64,
+    /// Channels that were not followed.
+    pub ignored_channels: Vec<IgnoredChannels>,
+    /// Times at which something jumps. A jump is a state of its own, of a millisecond.
+    pub jumps: u64,
+    /// Objects with a skin.
     pub skinned_objects: u64,
     /// Instances that a scale of zero flattens; their triangles were flattened one by one.
     pub flattened_instances: u64,
@@ -72,4 +104,15 @@ pub struct IngestReport {
     pub ignored_extensions: Vec<String>,
     /// What deserves a look, one sentence each.
     pub warnings: Vec<String>,
+}
+
+impl IngestReport {
+    /// Fills in the counts of particles.
+    pub(crate) fn count_particles(&mut self, systems: &[ParticleSystem]) {
+        let count = |occluder: bool| {
+            systems.iter().filter(|s| s.occluder == occluder).map(|s| s.len() as u64).sum::<u64>()
+        };
+        self.see_through_particles = count(false);
+        self.particles = self.see_through_particles + count(true);
+    }
 }

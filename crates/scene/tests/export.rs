@@ -4,15 +4,17 @@
 mod fixtures;
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use fixtures::{
-    Corners, Fixture, assert_same_triangles, files_below, open, scenes, world_triangles,
+    Corners, Fixture, assert_same_triangles, assert_valid, files_below, open, scenes,
+    world_triangles,
 };
 use serde_json::{Value, json};
-use sightline_geometry::{PrimitiveId, PrimitiveSet, Run};
+use sightline_geometry::{Moment, PrimitiveId, PrimitiveSet, Run};
 use sightline_scene::Scene;
-use sightline_scene::export::{ExportError, ExportReport, export_visible};
+use sightline_scene::export::{
+    ExportError, ExportOptions, ExportReport, export_visible, export_visible_with,
+};
 use sightline_scene::generate::{Kind, generate};
 
 fn all(scene: &Scene) -> PrimitiveSet {
@@ -35,13 +37,21 @@ fn some(scene: &Scene) -> PrimitiveSet {
 /// The exported scene has the triangles of the set, up to the rounding of transforms: JSON
 /// numbers are read to within one unit in the last place.
 fn assert_exports_exactly(scene: &Scene, set: &PrimitiveSet, exported: &Scene) {
+    assert_exports_at(Moment::START, scene, set, exported);
+}
+
+/// As [`assert_exports_exactly`], at a moment. What an animation or a skin places has positions of
+/// its own, rounded to `f32`.
+fn assert_exports_at(moment: Moment, scene: &Scene, set: &PrimitiveSet, exported: &Scene) {
+    assert!(!exported.geometry.has_motion());
     assert_eq!(u64::from(exported.geometry.primitive_count()), set.len());
     let wanted: Vec<Corners> = set
         .iter()
-        .map(|p: PrimitiveId| scene.geometry.triangle(p).corners.map(|c| c.to_array()))
+        .map(|p: PrimitiveId| scene.geometry.triangle_at(p, moment).corners.map(|c| c.to_array()))
         .collect();
     let largest = wanted.as_flattened().as_flattened().iter().fold(1.0, |m: f64, v| m.max(v.abs()));
-    assert_same_triangles(&wanted, &world_triangles(exported), 1e-12 * largest);
+    let rounding = if scene.instances.iter().any(|i| i.posed) { 1e-6 } else { 1e-12 };
+    assert_same_triangles(&wanted, &world_triangles(exported), rounding * largest);
 }
 
 /// A source on disk, opened, and a folder for the export.
@@ -78,22 +88,6 @@ fn json_of(glb: &Path) -> Value {
     let bytes = std::fs::read(glb).unwrap();
     let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
     serde_json::from_slice(&bytes[20..20 + length]).unwrap()
-}
-
-/// Passes files to the Khronos validator; skips loudly where it is not installed.
-fn assert_valid(files: &[&Path]) {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/gltf-validator");
-    if !folder.join("node_modules/gltf-validator").is_dir() {
-        #[allow(clippy::print_stderr)]
-        {
-            eprintln!("SKIPPED: no validator; run `npm ci` in {}", folder.display());
-        }
-        return;
-    }
-    let output = Command::new("node").arg(folder.join("validate.mjs")).args(files).output();
-    let output = output.expect("the validator is installed, so node runs");
-    let text = String::from_utf8_lossy(&output.stdout);
-    assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
 }
 
 #[test]
@@ -352,6 +346,73 @@ fn skins_and_morph_targets_leave_the_triangles_where_the_reader_saw_them() {
     assert_eq!(json["meshes"].as_array().unwrap().len(), 2);
     assert!(json.get("skins").is_none());
     assert_eq!(report.warnings.len(), 2, "{:?}", report.warnings);
+}
+
+/// Two moving squares, one of them mirrored, under a turning parent; and a strip on two joints.
+fn moving() -> Fixture {
+    let mut f = Fixture::square();
+    let normals = f.floats(&[[0.0, 0.0, 1.0f32]; 4]);
+    let tangents = f.floats(&[[1.0, 0.0, 0.0, 1.0f32]; 4]);
+    let attributes = &mut f.json["meshes"][0]["primitives"][0]["attributes"];
+    (attributes["NORMAL"], attributes["TANGENT"]) = (normals.into(), tangents.into());
+    f.json["scenes"][0]["nodes"] = json!([]);
+    let other = f.node(json!({"name": "mirrored", "mesh": 0, "scale": [-1.0, 2.0, 1.0]}));
+    let parent = f.root(json!({"children": [0, other], "translation": [1e5, 0.0, 0.0]}));
+    let joints = f.accessor(&[0, 1, 0, 0].repeat(4), 5121, "VEC4", 4);
+    let weights = f.floats(&[
+        [1.0, 0.0, 0.0, 0.0],
+        [0.5, 0.5, 0.0, 0.0],
+        [0.25, 0.75, 0.0, 0.0],
+        [0.0, 1.0, 0.0, 0.0f32],
+    ]);
+    let mut bound = f.json["meshes"][0]["primitives"][0].clone();
+    bound["attributes"]["JOINTS_0"] = joints.into();
+    bound["attributes"]["WEIGHTS_0"] = weights.into();
+    let mesh = f.mesh(bound);
+    f.root(json!({"name": "strip", "mesh": mesh, "skin": 0}));
+    let joint = f.root(json!({"translation": [0.0, 3.0, 0.0]}));
+    f.json["skins"] = json!([{"joints": [parent, joint]}]);
+    let times = f.floats(&[[0.0], [2.0f32]]);
+    f.json["accessors"][times as usize]["min"] = json!([0.0]);
+    f.json["accessors"][times as usize]["max"] = json!([2.0]);
+    let turns = f.floats(&[[0.0, 0.0, 0.0, 1.0f32], [0.0, 0.6, 0.0, 0.8]]);
+    f.json["animations"] = json!([{"samplers": [{"input": times, "output": turns}], "channels":
+        [{"sampler": 0, "target": {"node": parent, "path": "rotation"}}]}]);
+    f
+}
+
+#[test]
+fn what_moves_is_frozen_at_the_moment_and_the_file_is_at_rest() {
+    let place = Workplace::new("moving.glb", &moving().glb());
+    let scene = &place.scene;
+    assert!(scene.geometry.states > 2);
+    for seconds in [0.0, 0.77, 2.0] {
+        let moment = scene.moment_at(seconds);
+        for set in [all(scene), some(scene)] {
+            let out = place.out();
+            let options = ExportOptions::at(moment);
+            let report = export_visible_with(&place.source, scene, &set, options, &out).unwrap();
+            assert_valid(&[&out]);
+            assert_eq!(report.triangles, set.len());
+            assert_exports_at(moment, scene, &set, &open(&out).unwrap());
+            let json = json_of(&out);
+            assert!(json.get("animations").is_none() && json.get("skins").is_none());
+        }
+    }
+    let json = json_of(&place.out());
+    let mirrored = json["nodes"].as_array().unwrap().iter().find(|n| n["name"] == "mirrored");
+    assert_eq!(mirrored.unwrap()["scale"], json!([-1.0, 1.0, 1.0]));
+}
+
+#[test]
+fn a_moment_that_the_scene_does_not_have_is_refused() {
+    let place = Workplace::new("square.glb", &Fixture::square().glb());
+    for (state, t) in [(1, 0.0), (0, 1.5), (0, f64::NAN)] {
+        let options = ExportOptions::at(Moment { state, t });
+        let (source, scene, set) = (&place.source, &place.scene, all(&place.scene));
+        let error = export_visible_with(source, scene, &set, options, &place.out()).unwrap_err();
+        assert!(matches!(error, ExportError::NoSuchMoment { states: 1, .. }), "{error}");
+    }
 }
 
 #[test]

@@ -1,13 +1,22 @@
 //! What the generated scenes promise, read from their bytes without the scene reader, and that
 //! the scene reader opens them.
 
+mod fixtures;
+
 use std::collections::HashMap;
 use std::path::Path;
 
+use fixtures::assert_valid;
 use glam::{DAffine3, DQuat, DVec3};
 use serde_json::Value;
-use sightline_scene::generate::{GenerateError, GenerateReport, Kind, generate};
+use sightline_geometry::Sphere;
+use sightline_scene::generate::{
+    GenerateError, GenerateReport, Kind, SPHERES_RANGE, STATES_RANGE, bouncing_spheres, generate,
+};
+use sightline_scene::particles::{TableFormat, read_table};
 use sightline_scene::{OpenOptions, Scene};
+
+const SWAYING: Kind = Kind::SwayingGrass { states: 10 };
 
 fn bytes_of(kind: Kind, triangles: u64, seed: u64) -> (GenerateReport, Vec<u8>) {
     let mut bytes = vec![];
@@ -47,6 +56,7 @@ impl Glb {
         let (a, bytes) = self.accessor(index);
         assert_eq!(a["componentType"], 5126);
         let width = match a["type"].as_str().unwrap() {
+            "SCALAR" => 1,
             "VEC3" => 3,
             _ => 4,
         };
@@ -151,7 +161,9 @@ fn within_two_percent(wanted: u64, got: u64) {
 
 #[test]
 fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
-    for (kind, n) in [(Kind::City, 60_000), (Kind::Town, 60_000), (Kind::Grass, 60_000)] {
+    for (kind, n) in
+        [(Kind::City, 60_000), (Kind::Town, 60_000), (Kind::Grass, 60_000), (SWAYING, 60_000)]
+    {
         let a = bytes_of(kind, n, 7);
         assert_eq!(a, bytes_of(kind, n, 7));
         assert_ne!(a.1, bytes_of(kind, n, 8).1);
@@ -162,8 +174,14 @@ fn the_same_seed_gives_the_same_bytes_and_another_seed_others() {
 #[test]
 fn the_bytes_are_pinned() {
     let hash = |kind| blake3::hash(&bytes_of(kind, 60_000, 1).1).to_hex()[..16].to_owned();
-    let pinned = [Kind::City, Kind::Town, Kind::Grass].map(hash);
-    assert_eq!(pinned, ["840d1577a877beef", "abd054e4e3fb3f7f", "4a0c0925ce098f0e"]);
+    let pinned = [Kind::City, Kind::Town, Kind::Grass, SWAYING].map(hash);
+    assert_eq!(
+        pinned,
+        ["840d1577a877beef", "abd054e4e3fb3f7f", "4a0c0925ce098f0e", "e4045b18bb14d863"]
+    );
+    let hash = |format| blake3::hash(&spheres_of(2000, 5, 1, format).1).to_hex()[..16].to_owned();
+    let pinned = [TableFormat::Parquet, TableFormat::Csv].map(hash);
+    assert_eq!(pinned, ["845f84531d1340c7", "3dc1e8557f74f2a0"]);
 }
 
 #[test]
@@ -185,11 +203,20 @@ fn triangle_counts_are_hit_within_two_percent() {
 
 #[test]
 fn counts_out_of_range_are_refused() {
-    for kind in [Kind::City, Kind::Town, Kind::Grass] {
+    for kind in [Kind::City, Kind::Town, Kind::Grass, SWAYING] {
         for n in [0, kind.triangle_range().start() - 1, kind.triangle_range().end() + 1] {
             let result = generate(kind, n, 1, &mut vec![]);
             assert!(matches!(result, Err(GenerateError::Size { requested, .. }) if requested == n));
         }
+    }
+    for states in [0, STATES_RANGE.end() + 1] {
+        let refused = |result| matches!(result, Err(GenerateError::States { requested }) if requested == states);
+        assert!(refused(generate(Kind::SwayingGrass { states }, 60_000, 1, &mut vec![])));
+        assert!(refused(bouncing_spheres(9, states, 1, TableFormat::Csv, &mut vec![])));
+    }
+    for n in [0, SPHERES_RANGE.end() + 1] {
+        let result = bouncing_spheres(n, 5, 1, TableFormat::Csv, &mut vec![]);
+        assert!(matches!(result, Err(GenerateError::Spheres { requested }) if requested == n));
     }
 }
 
@@ -359,5 +386,126 @@ fn the_reader_opens_what_is_generated() {
         if kind == Kind::City {
             assert!(names.contains(&"block_0_0/building_0"));
         }
+    }
+}
+
+#[test]
+fn the_swaying_meadow_at_rest_is_the_meadow() {
+    let still = Glb::parse(&bytes_of(Kind::Grass, 300_000, 3).1);
+    let (report, bytes) = bytes_of(SWAYING, 300_000, 3);
+    let swaying = Glb::parse(&bytes);
+    assert_eq!(report.states, 10);
+    assert_eq!(still.mesh_count(), swaying.mesh_count());
+    for m in 0..still.mesh_count() {
+        assert_eq!(still.mesh(m), swaying.mesh(m));
+    }
+    let shape = |glb: &Glb| -> Vec<_> {
+        glb.placements()
+            .into_iter()
+            .map(|(world, mesh, name)| (world.translation, mesh, name))
+            .collect()
+    };
+    assert_eq!(shape(&still), shape(&swaying));
+}
+
+#[test]
+fn in_the_wind_all_blades_and_flowers_move_and_the_ground_rests() {
+    let glb = Glb::parse(&bytes_of(SWAYING, 300_000, 3).1);
+    for m in 0..glb.mesh_count() {
+        for primitive in glb.json["meshes"][m]["primitives"].as_array().unwrap() {
+            let Some(targets) = primitive["targets"].as_array() else {
+                assert_eq!(glb.mesh_name(m), "ground");
+                continue;
+            };
+            let positions = glb.floats(&primitive["attributes"]["POSITION"]);
+            let targets: Vec<Vec<f32>> =
+                targets.iter().map(|t| glb.floats(&t["POSITION"])).collect();
+            assert_eq!(targets.len(), 2);
+            let displaced = |t: &[f32], v: usize| {
+                DVec3::new(t[3 * v].into(), t[3 * v + 1].into(), t[3 * v + 2].into()).length()
+            };
+            for v in 0..positions.len() / 3 {
+                let height = positions[3 * v + 1];
+                for target in &targets {
+                    let way = displaced(target, v);
+                    assert_eq!(way > 0.0, height > -0.0599, "{height} m: {way} m");
+                    if (0.49..0.51).contains(&height) {
+                        assert!((0.02..0.05).contains(&way), "{way} m, to either side");
+                    }
+                }
+            }
+            for t in glb.indices(&primitive["indices"]).chunks(3) {
+                assert!(t.iter().any(|&v| displaced(&targets[0], v as usize) > 0.0));
+            }
+        }
+    }
+    // Every node of a model sways, in one of few ways.
+    let animation = &glb.json["animations"][0];
+    let (channels, samplers) =
+        (animation["channels"].as_array().unwrap(), animation["samplers"].as_array().unwrap());
+    let nodes = glb.json["nodes"].as_array().unwrap().iter();
+    assert_eq!(channels.len(), nodes.filter(|n| !n["extensions"].is_null()).count());
+    assert_eq!(samplers.len(), 4);
+    for sampler in samplers {
+        let times = glb.floats(&sampler["input"]);
+        assert_eq!((times.len(), times[0], times[10]), (11, 0.0, 2.5));
+        assert_eq!(glb.floats(&sampler["output"]).len(), 22);
+    }
+}
+
+#[test]
+fn the_swaying_meadow_passes_the_validator() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("meadow.glb");
+    std::fs::write(&path, bytes_of(SWAYING, 60_000, 1).1).unwrap();
+    assert_valid(&[&path]);
+}
+
+fn spheres_of(
+    count: u64,
+    states: u32,
+    seed: u64,
+    format: TableFormat,
+) -> (GenerateReport, Vec<u8>) {
+    let mut bytes = vec![];
+    let report = bouncing_spheres(count, states, seed, format, &mut bytes).unwrap();
+    assert_eq!(report.bytes, bytes.len() as u64);
+    assert_eq!((report.particles, report.states), (count, states));
+    (report, bytes)
+}
+
+#[test]
+fn spheres_bounce_apart_from_each_other_and_come_to_rest() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, format) in [("a.parquet", TableFormat::Parquet), ("a.csv", TableFormat::Csv)] {
+        let path = folder.path().join(name);
+        let (report, bytes) = spheres_of(10_000, 25, 1, format);
+        assert_eq!(bytes, spheres_of(10_000, 25, 1, format).1);
+        assert_ne!(bytes, spheres_of(10_000, 25, 2, format).1);
+        std::fs::write(&path, bytes).unwrap();
+        let table = read_table(&path, 1 << 20).unwrap();
+        assert_eq!((table.keys.len(), table.ids.len(), table.key_times[25]), (26, 10_000, 5.0));
+        let low = |s: &Sphere| s.center().y + table.origin.y - f64::from(s.radius);
+        let last = &table.keys[25];
+        assert!(last.iter().all(|s| low(s) == 0.0), "all rest on the ground");
+        assert!(table.keys.iter().flatten().all(|s| low(s) >= 0.0), "none is in the ground");
+        let high = |key: usize| table.keys[key].iter().map(low).sum::<f64>() / 10_000.0;
+        assert!(high(0) > 1.2 && high(12) < high(0) && high(20) < 0.2, "they lose energy");
+        // A column of 1 m each: none ever meets another.
+        let mut columns: Vec<[i64; 2]> = vec![];
+        for s in last {
+            let (at, r) = (s.center() + table.origin, f64::from(s.radius));
+            assert_eq!((at.x - r).floor(), (at.x + r).ceil() - 1.0);
+            assert_eq!((at.z - r).floor(), (at.z + r).ceil() - 1.0);
+            columns.push([at.x.floor() as i64, at.z.floor() as i64]);
+        }
+        columns.sort_unstable();
+        columns.dedup();
+        assert_eq!(columns.len(), 10_000);
+        let size = report.bounds.size();
+        assert!((99.0..=100.0).contains(&size.x) && (99.0..=100.0).contains(&size.z), "{size}");
+        let scene = Scene::open(&path, &OpenOptions::default()).unwrap();
+        scene.assert_well_formed();
+        assert_eq!((scene.geometry.states, scene.geometry.primitive_count()), (25, 10_000));
     }
 }

@@ -46,7 +46,45 @@ fn seeds() -> Vec<Vec<u8>> {
     out.push(sparse.glb());
 
     out.push(meshopt_square());
+    out.extend(animated());
     out
+}
+
+/// Channels of every kind on nodes, a skin and morph targets.
+fn animated() -> [Vec<u8>; 2] {
+    let mut f = Fixture::square();
+    let joints = f.accessor(&[0, 1, 0, 0].repeat(4), 5121, "VEC4", 4);
+    let weights = f.floats(&[[0.5, 0.5, 0.0, 0.0f32]; 4]);
+    let delta = f.floats(&[[0.0, 0.0, 1.0f32]; 4]);
+    let primitive = &mut f.json["meshes"][0]["primitives"][0];
+    primitive["attributes"]["JOINTS_0"] = joints.into();
+    primitive["attributes"]["WEIGHTS_0"] = weights.into();
+    primitive["targets"] = json!([{"POSITION": delta}]);
+    let identity: [f32; 16] = std::array::from_fn(|i| if i % 5 == 0 { 1.0 } else { 0.0 });
+    let bytes: Vec<u8> =
+        [identity; 2].as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
+    let inverse = f.accessor(&bytes, 5126, "MAT4", 2);
+    let child = f.node(json!({"mesh": 0, "translation": [0.0, 1.0, 0.0]}));
+    let parent = f.root(json!({"children": [child], "scale": [1.0, 2.0, 1.0]}));
+    f.json["nodes"][0]["skin"] = json!(0);
+    f.json["skins"] = json!([{"joints": [parent, child], "inverseBindMatrices": inverse}]);
+    let times = f.floats(&[[0.0], [0.5], [1.0f32]]);
+    let turns = f.floats(&[[0.0, 0.0, 0.0, 1.0], [0.0, 0.6, 0.0, 0.8], [1.0, 0.0, 0.0, 0.0f32]]);
+    let spline = f.floats(&[[0.5f32, 0.1, 0.2]; 9]);
+    let faces = f.floats(&[[0.0], [1.0], [0.5f32]]);
+    let channel = |sampler: u32, node: u32, path: &str| json!({"sampler": sampler, "target": {"node": node, "path": path}});
+    f.json["animations"] = json!([{"samplers": [
+        {"input": times, "output": turns, "interpolation": "LINEAR"},
+        {"input": times, "output": spline, "interpolation": "CUBICSPLINE"},
+        {"input": times, "output": faces, "interpolation": "STEP"},
+    ], "channels": [
+        channel(0, parent, "rotation"), channel(0, child, "rotation"),
+        channel(1, child, "translation"), channel(1, parent, "scale"),
+        channel(2, child, "weights"),
+        {"sampler": 2, "target": {"path": "pointer", "extensions":
+            {"KHR_animation_pointer": {"pointer": "/nodes/0/weights"}}}},
+    ]}]);
+    [f.glb(), f.gltf()]
 }
 
 /// A square whose positions and indices are compressed.

@@ -9,15 +9,18 @@
 //!   k = d . d: seen from outside it is the smaller, a convex function of t, since the points of
 //!   (t, depth) that are inside of the ball are a convex set; from inside the larger, a concave one.
 //!
-//! An arc is held between two lines parallel to its chord, a [`Band`]. Over a stretch that is split,
-//! bands get thinner with the square of its length, so who is nearer, and where that changes, is
-//! found by splitting until bands do not overlap: [`order`]. Arcs that run side by side would be split
-//! without end; their difference decides, `side_by_side`. Where depths differ by less than the
-//! rounding of both, the two are equal there; equal on all of what they share, the lower number is
-//! nearer, else what is beside it decides, as for lines.
+//! An arc is held between two lines parallel to its chord, a [`Band`]: mostly that is enough to tell who
+//! of two is nearer. Where it is not, [`order`] looks where they may change places. Depths are
+//! (A -+ sqrt(C)) / B with polynomials A, B, C (C = 0 for triangles and lines, B = 1 for spheres and lines),
+//! so that is where a polynomial changes its sign:
 //!
-//! What rounding does to a depth depends on where on the arc it is: N / D is uncertain where D is small, a
-//! root where what it is of is. So a stretch on which that varies is split before it is called equal.
+//! - two triangles: N1 D2 - N2 D1, of degree 5;
+//! - a triangle and a sphere: (N - foot D)^2 - C D^2, of degree 6;
+//! - two spheres, with the distance d of their feet: (C1 - C2 - d^2)^2 - 4 d^2 C2, of degree 4.
+//!
+//! Between two such places the depths in the middle decide. Where depths differ by less than the rounding
+//! of both, the two are equal; equal on all of what they share, the lower number is nearer, else
+//! what is beside it decides, as for lines. (The source excludes spheres that cross.)
 //!
 //! Derivation of the bands. *Rational*: with the chord c(t) between the exact ends, N - c D is a cubic
 //! that is 0 at both ends, so at most 3/4 of the larger of its two inner coefficients, and |D| is at
@@ -28,7 +31,7 @@
 use sightline_geometry::UNIT_ROUNDOFF;
 
 use crate::{
-    bernstein::{cubic, cubic_on, linear, quadratic, quadratic_on},
+    bernstein::{Polynomial, cubic, cubic_on, linear, quadratic, quadratic_on},
     envelope::{Line, largest, least},
 };
 
@@ -89,9 +92,6 @@ pub struct Band {
     pub above: f64,
     /// Rounding error of all depths, metres.
     pub error: f64,
-    /// False when parts of the stretch may have much less of that: where a triangle is seen edge-on at one
-    /// end, D is small there and noise is large.
-    pub even: bool,
 }
 
 impl Arc {
@@ -120,18 +120,12 @@ impl Arc {
     pub fn band(&self, s: f64, e: f64) -> Band {
         let (z0, z1) = (self.depth(s), self.depth(e));
         let whole = self.far - self.near;
-        let mut even = true;
         let (below, above, error) = match &self.shape {
             Shape::Rational { n, d, n_error, d_error } => {
                 let (n, d) = (cubic_on(*n, s, e), quadratic_on(*d, s, e));
                 let least_d = least(least(d[0].abs(), d[1].abs()), d[2].abs());
-                let largest_d = largest(largest(d[0].abs(), d[1].abs()), d[2].abs());
                 let one_sign = (d[0] > 0.0) == (d[1] > 0.0) && (d[1] > 0.0) == (d[2] > 0.0);
-                if largest_d <= 4.0 * d_error {
-                    // D is rounding all over: no part of the stretch tells more than the corners do.
-                    (0.0, 0.0, self.error + whole)
-                } else if !one_sign || least_d <= 2.0 * d_error {
-                    even = false;
+                if !one_sign || least_d <= 2.0 * d_error {
                     (whole, whole, self.error)
                 } else {
                     let inner = [
@@ -144,8 +138,6 @@ impl Arc {
                     // What moves fast may be far away at another time: here no depth is beyond this.
                     let top = least(largest(z0, z1) + bulge, self.far);
                     let noise = 2.0 * (n_error + top * d_error) * inverse;
-                    let like = top * d_error <= *n_error || top <= 2.0 * least(z0, z1);
-                    even = noise <= self.error || (largest_d <= 2.0 * least_d && like);
                     (bulge, bulge, self.error + least(noise, whole))
                 }
             }
@@ -158,17 +150,20 @@ impl Arc {
                 let bulge =
                     if k > 0.0 { least(0.5 * k.sqrt(), k / (8.0 * least(h0, h1))) } else { 0.0 };
                 let bulge = bulge * inverse;
-                // A root of g is off by noise / (2 sqrt(g)), or the root of noise where g is no more.
-                let (low, high) =
-                    (least(least(g[0], g[1]), g[2]), largest(largest(g[0], g[1]), g[2]));
-                let off = if low > *noise { noise / low.sqrt() } else { noise.sqrt() };
-                let error = self.error + off * inverse;
-                even = off * inverse <= self.error || high <= 16.0 * largest(low, *noise);
+                let low = least(least(g[0], g[1]), g[2]);
+                let error = self.error + root_noise(low, *noise) * inverse;
                 if *from_inside { (0.0, bulge, error) } else { (bulge, 0.0, error) }
             }
         };
-        Band { z0, z1, below, above, error, even }
+        Band { z0, z1, below, above, error }
     }
+}
+
+/// What the root of a value v of a function is off by where that is off by `noise` either way: sqrt(v) -
+/// sqrt(v - noise), without cancellation; the root of the noise where v is no more.
+#[inline(always)]
+fn root_noise(v: f64, noise: f64) -> f64 {
+    if v > noise { noise / (v.sqrt() + (v - noise).sqrt()) } else { noise.sqrt() }
 }
 
 /// Who is nearer, stretch by stretch.
@@ -184,8 +179,8 @@ pub struct Order {
 
 impl Order {
     /// Two rational depths cross at most five times, a sphere and such a depth six times; the rest is
-    /// room for touches that rounding breaks up.
-    pub const MOST: usize = 12;
+    /// room for what rounding breaks up.
+    pub const MOST: usize = 10;
 }
 
 /// A line or an arc.
@@ -198,109 +193,90 @@ pub struct Curve<'a> {
 }
 
 impl Curve<'_> {
-    fn band(&self, s: f64, e: f64) -> Band {
-        match self.arc {
-            Some(arc) => arc.band(s, e),
-            None => {
-                let (z0, z1) = (self.line.depth(s), self.line.depth(e));
-                Band { z0, z1, below: 0.0, above: 0.0, error: self.line.above, even: true }
+    /// Depth at `t` and its largest error, metres.
+    fn depth(&self, t: f64) -> (f64, f64) {
+        let Some(arc) = self.arc else { return (self.line.depth(t), self.line.above) };
+        let z = arc.depth(t);
+        let error = match &arc.shape {
+            Shape::Rational { d, n_error, d_error, .. } => {
+                let noise = 2.0 * (n_error + z * d_error) / quadratic(*d, t).abs();
+                // NaN, where D is 0, becomes the whole.
+                arc.error + if noise < arc.far - arc.near { noise } else { arc.far - arc.near }
+            }
+            Shape::Ball { g, noise, inverse, .. } => {
+                arc.error + root_noise(quadratic(*g, t), *noise) * inverse
+            }
+        };
+        (z, error)
+    }
+
+    /// Its depth as (A -+ sqrt(C)) / B on a stretch.
+    fn on(&self, s: f64, e: f64) -> Terms {
+        let none = (Polynomial::new(&[0.0]), 0.0);
+        let one = (Polynomial::new(&[1.0]), 0.0);
+        let Some(arc) = self.arc else {
+            let a = Polynomial::new(&[self.line.depth(s), self.line.depth(e)]);
+            return Terms { a: (a, self.line.above), b: one, c: none };
+        };
+        match &arc.shape {
+            Shape::Rational { n, d, n_error, d_error } => Terms {
+                a: (Polynomial::new(&cubic_on(*n, s, e)), *n_error),
+                b: (Polynomial::new(&quadratic_on(*d, s, e)), *d_error),
+                c: none,
+            },
+            Shape::Ball { foot, g, noise, inverse, .. } => {
+                let a = Polynomial::new(&[linear(*foot, s), linear(*foot, e)]);
+                let scale = inverse * inverse;
+                let c = quadratic_on(*g, s, e).map(|g| g * scale);
+                Terms { a: (a, arc.error), b: one, c: (Polynomial::new(&c), noise * scale) }
             }
         }
+    }
+
+    fn is_ball(&self) -> bool {
+        matches!(self.arc, Some(Arc { shape: Shape::Ball { .. }, .. }))
     }
 }
 
-/// N, D and their errors on a stretch, Bernstein coefficients.
-type OnStretch = ([f64; 4], [f64; 3], f64, f64);
+/// A polynomial and the largest error of a value.
+type Noisy = (Polynomial, f64);
 
-impl Curve<'_> {
-    /// A line, or the depth of a triangle, as a quotient on `s..e`.
-    fn quotient(&self, s: f64, e: f64) -> Option<OnStretch> {
-        match self.arc.map(|arc| &arc.shape) {
-            None => {
-                let (a, b) = (self.line.depth(s), self.line.depth(e));
-                let n = [a, (2.0 * a + b) / 3.0, (a + 2.0 * b) / 3.0, b];
-                Some((n, [1.0; 3], 4.0 * UNIT_ROUNDOFF * largest(a, b), 0.0))
-            }
-            Some(Shape::Rational { n, d, n_error, d_error }) => {
-                Some((cubic_on(*n, s, e), quadratic_on(*d, s, e), *n_error, *d_error))
-            }
-            Some(Shape::Ball { .. }) => None,
-        }
-    }
+/// A depth as (A -+ sqrt(C)) / B.
+struct Terms {
+    a: Noisy,
+    b: Noisy,
+    c: Noisy,
 }
 
-/// The sign of the difference of two depths all over `s..e`, where that is certain; 0 where both are equal
-/// within their bounds. `error` is that of both depths at exact N and D, `noise` that of their bands.
-///
-/// Two arcs that run side by side have bands that overlap until both are as thin as they are apart, which
-/// is never for two triangles of one plane. Their difference does not bend: of quotients it has the sign
-/// of `N D' - N' D`, of degree 5, times that of `D D'`; that of two spheres is that of their feet, and that
-/// of their g by the sum of the roots.
-fn side_by_side(a: Curve, b: Curve, (s, e): (f64, f64), error: f64, noise: f64) -> Option<i32> {
-    if let (Some(a), Some(b)) = (a.arc, b.arc)
-        && let (
-            Shape::Ball { foot: f, g, inverse, from_inside, .. },
-            Shape::Ball { foot: k, g: h, from_inside: other, .. },
-        ) = (&a.shape, &b.shape)
-    {
-        let (g, h) = (quadratic_on(*g, s, e), quadratic_on(*h, s, e));
-        let ends = |v: &[f64]| {
-            v.iter()
-                .fold((f64::INFINITY, f64::NEG_INFINITY), |m, v| (least(m.0, *v), largest(m.1, *v)))
-        };
-        let feet = ends(&[linear(*f, s) - linear(*k, s), linear(*f, e) - linear(*k, e)]);
-        let (in_g, in_h) = (ends(&g), ends(&h));
-        if from_inside != other || least(in_g.0, in_h.0) <= 0.0 {
-            let same = feet == (0.0, 0.0) && g == h && from_inside == other;
-            return same.then_some(0);
+fn times(p: &Noisy, q: &Noisy) -> Noisy {
+    let (x, y) = (p.0.size(), q.0.size());
+    let rounding = 16.0 * UNIT_ROUNDOFF * x * y;
+    (p.0.times(&q.0), p.1 * y + q.1 * x + p.1 * q.1 + rounding)
+}
+
+fn minus(p: &Noisy, q: &Noisy) -> Noisy {
+    let rounding = 16.0 * UNIT_ROUNDOFF * (p.0.size() + q.0.size());
+    (p.0.minus(&q.0), p.1 + q.1 + rounding)
+}
+
+/// A polynomial that changes its sign wherever the two change places.
+fn meeting(a: &Curve, b: &Curve, s: f64, e: f64) -> Noisy {
+    let (p, q) = (a.on(s, e), b.on(s, e));
+    match (a.is_ball(), b.is_ball()) {
+        (false, false) => minus(&times(&p.a, &q.b), &times(&q.a, &p.b)),
+        (true, true) => {
+            let apart = minus(&p.a, &q.a);
+            let square = times(&apart, &apart);
+            let rest = minus(&minus(&p.c, &q.c), &square);
+            let four = (Polynomial::new(&[4.0]), 0.0);
+            minus(&times(&rest, &rest), &times(&four, &times(&square, &q.c)))
         }
-        // sqrt(g) - sqrt(h) = (g - h) / (sqrt(g) + sqrt(h)).
-        let apart = ends(&[g[0] - h[0], g[1] - h[1], g[2] - h[2]]);
-        let sums = (in_g.0.sqrt() + in_h.0.sqrt(), in_g.1.sqrt() + in_h.1.sqrt());
-        let high = apart.1 * inverse / if apart.1 > 0.0 { sums.0 } else { sums.1 };
-        let low = apart.0 * inverse / if apart.0 < 0.0 { sums.0 } else { sums.1 };
-        let (low, high) = if *from_inside { (low, high) } else { (-high, -low) };
-        let (low, high) = (feet.0 + low, feet.1 + high);
-        return if low > noise {
-            Some(1)
-        } else if high < -noise {
-            Some(-1)
-        } else {
-            (low >= -noise && high <= noise).then_some(0)
-        };
-    }
-    let (n, d, n_error, d_error) = a.quotient(s, e)?;
-    let (m, f, m_error, f_error) = b.quotient(s, e)?;
-    let size = |of: &[f64]| of.iter().fold(0.0, |most, v| largest(most, v.abs()));
-    let (d_size, f_size) = (size(&d), size(&f));
-    let one_sign = |v: &[f64; 3]| (v[0] > 0.0) == (v[1] > 0.0) && (v[1] > 0.0) == (v[2] > 0.0);
-    if !one_sign(&d) || !one_sign(&f) {
-        return None;
-    }
-    // C(3, i) C(2, j) / C(5, i + j).
-    let p = |i: usize, j: usize| n[i] * f[j] - m[i] * d[j];
-    let difference = [
-        p(0, 0),
-        (2.0 * p(0, 1) + 3.0 * p(1, 0)) / 5.0,
-        (p(0, 2) + 6.0 * p(1, 1) + 3.0 * p(2, 0)) / 10.0,
-        (3.0 * p(1, 2) + 6.0 * p(2, 1) + p(3, 0)) / 10.0,
-        (3.0 * p(2, 2) + 2.0 * p(3, 1)) / 5.0,
-        p(3, 2),
-    ];
-    let most = error * d_size * f_size
-        + n_error * f_size
-        + size(&n) * f_error
-        + m_error * d_size
-        + size(&m) * d_error;
-    let sign = if (d[0] > 0.0) == (f[0] > 0.0) { 1 } else { -1 };
-    if difference.iter().all(|v| v.abs() <= most) {
-        Some(0)
-    } else if difference.iter().all(|v| *v > most) {
-        Some(sign)
-    } else if difference.iter().all(|v| *v < -most) {
-        Some(-sign)
-    } else {
-        None
+        (ball_first, _) => {
+            let (ball, other) = if ball_first { (p, q) } else { (q, p) };
+            let off = minus(&other.a, &times(&ball.a, &other.b));
+            let square = times(&other.b, &other.b);
+            minus(&times(&off, &off), &times(&ball.c, &square))
+        }
     }
 }
 
@@ -311,69 +287,79 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
     let (from, to) = (largest(a.line.start, b.line.start), least(a.line.end, b.line.end));
     let (from, to) = (largest(from, 0.0), least(to, 1.0));
     let mut runs = Runs::default();
-    // No stretch is split to less than this: neither ends nor depths have a meaning there.
-    let shortest = 16.0 * UNIT_ROUNDOFF;
-    // Nor are more stretches looked at: a hundred or two are many.
-    let mut left = 1 << 14;
-    // What both are off by, whatever D is.
-    let base = [a, b].map(|c| c.arc.map_or(c.line.above, |arc| arc.error));
-    let mut stack = [(0.0, 0.0); 64];
-    stack[0] = (from, to);
-    let mut open = usize::from(from < to);
+    let sign = |t: f64| {
+        let ((p, p_error), (q, q_error)) = (a.depth(t), b.depth(t));
+        let (difference, noise) = (p - q, p_error + q_error);
+        i32::from(difference > noise) - i32::from(difference < -noise)
+    };
+    let with_ball = a.is_ball() || b.is_ball();
+    if with_ball {
+        // Where a sphere comes into sight it is steep, and what it passes there is passed at once.
+        (0..NEAR_ENDS).rev().for_each(|k| runs.push(from + share_of(k) * (to - from), from, &sign));
+    }
+    // One entry a level, and one more.
+    let mut stack = [(from, to, 0); LEVELS + 2];
+    let mut open = usize::from(from < to && !are_one(&a, &b));
     while open > 0 {
         open -= 1;
-        let (s, e) = stack[open];
-        let (p, q) = (a.band(s, e), b.band(s, e));
-        let (d0, d1) = (p.z0 - q.z0, p.z1 - q.z1);
-        let (below, above) = (p.below + q.above, p.above + q.below);
-        let noise = p.error + q.error;
-        if largest(d0, d1) + above < -noise {
-            runs.push(s, e, -1);
-            continue;
-        }
-        if least(d0, d1) - below > noise {
-            runs.push(s, e, 1);
-            continue;
-        }
-        if p.even
-            && q.even
-            && let Some(sign) = side_by_side(a, b, (s, e), base[0] + base[1], noise)
-        {
-            runs.push(s, e, sign);
-            continue;
-        }
-        let certain = |d: f64| i32::from(d > noise) - i32::from(d < -noise);
-        let (at_s, at_e) = (certain(d0), certain(d1));
-        let bulge = below + above;
-        let thin = bulge <= 0.5 * noise && p.even && q.even;
-        left -= 1;
-        // Bands as thin as rounding: lines.
-        if thin || e - s <= shortest || open + 3 > stack.len() || left <= 0 {
-            match (at_s, at_e) {
-                (0, 0) => runs.push(s, e, 0),
-                (x, y) if x * y < 0 => {
-                    let t = least(largest(s + (e - s) * (d0 / (d0 - d1)), s), e);
-                    runs.push(s, t, x);
-                    runs.push(t, e, y);
-                }
-                (x, y) => runs.push(s, e, x + y),
+        let (s, e, level) = stack[open];
+        let (meeting, noise) = meeting(&a, &b, s, e);
+        let mut borders = [e; Polynomial::MOST + 2];
+        let mut count = 0;
+        let certain = meeting.sign_changes(noise, |at| {
+            if count <= Polynomial::MOST {
+                borders[count] = s + at * (e - s);
+                count += 1;
             }
+        });
+        // A sphere's polynomial has more than one factor: noise that is nothing beside one of them may
+        // hide another. On shorter stretches all are smaller.
+        if !certain && level < LEVELS && with_ball {
+            let middle = 0.5 * (s + e);
+            stack[open] = (middle, e, level + 1);
+            stack[open + 1] = (s, middle, level + 1);
+            open += 2;
             continue;
         }
-        let slope = (d1 - d0) / (e - s);
-        let crossing = s - d0 / slope;
-        let reach = 1.5 * (bulge + noise) / slope.abs();
-        let (left, right) = (crossing - reach, crossing + reach);
-        if at_s * at_e < 0 && s < left && right < e && right - left < 0.5 * (e - s) {
-            stack[open..open + 3].copy_from_slice(&[(right, e), (left, right), (s, left)]);
-            open += 3;
-        } else {
-            let middle = 0.5 * (s + e);
-            stack[open..open + 2].copy_from_slice(&[(middle, e), (s, middle)]);
-            open += 2;
+        let mut from = s;
+        for &to in &borders[..=count] {
+            if from < to {
+                // A change that hides in the noise shows at one of these.
+                for share in [1.0 / 64.0, 0.5, 63.0 / 64.0] {
+                    runs.push(from + share * (to - from), from, &sign);
+                }
+            }
+            from = to;
         }
     }
+    if with_ball {
+        (0..NEAR_ENDS).for_each(|k| runs.push(to - share_of(k) * (to - from), from, &sign));
+    }
     runs.order(lower_wins)
+}
+
+/// Places close to each end of a stretch at which two are compared.
+const NEAR_ENDS: i32 = 40;
+
+/// How far from the end they are, as a share of the stretch: under a 256th of it, each half as far as the
+/// one before.
+fn share_of(k: i32) -> f64 {
+    2.0f64.powi(-9 - k)
+}
+
+/// Halvings of a stretch on which a sphere's polynomial is noise.
+const LEVELS: usize = 8;
+
+/// True for two spheres that are one: equal wherever both are.
+fn are_one(a: &Curve, b: &Curve) -> bool {
+    let (Some(a), Some(b)) = (a.arc, b.arc) else { return false };
+    match (&a.shape, &b.shape) {
+        (
+            Shape::Ball { foot: p, g, from_inside, .. },
+            Shape::Ball { foot: q, g: h, from_inside: other, .. },
+        ) => (p, g, from_inside) == (q, h, other),
+        _ => false,
+    }
 }
 
 /// Stretches with the sign of the difference; what is equal, between.
@@ -381,34 +367,40 @@ pub fn order(a: Curve, b: Curve, lower_wins: bool) -> Order {
 struct Runs {
     first: i32,
     last: i32,
-    /// Since when it is equal.
-    equal_since: Option<f64>,
+    /// Where the last sign was seen.
+    seen: f64,
     count: usize,
     changes: [f64; Order::MOST],
 }
 
 impl Runs {
-    fn push(&mut self, s: f64, _e: f64, sign: i32) {
-        let sign = sign.signum();
-        if sign == 0 {
-            self.equal_since.get_or_insert(s);
+    /// Looks at `t`, later than before. `border` is where the sign changes if that is between: elsewhere
+    /// the change is looked for by halving.
+    fn push(&mut self, t: f64, border: f64, sign_at: &impl Fn(f64) -> i32) {
+        let sign = sign_at(t);
+        if sign == 0 || t <= self.seen {
             return;
         }
         if self.last == 0 {
             self.first = sign;
-        } else if self.last != sign {
-            // In the middle of where both are equal.
-            let at = self.equal_since.map_or(s, |since| 0.5 * (since + s));
-            if self.count < Order::MOST {
-                self.changes[self.count] = at;
-                self.count += 1;
-            } else {
-                // Two more that touch: they take the last change back.
-                self.count -= 1;
+        } else if self.last != sign && self.count < Order::MOST {
+            let mut change = border;
+            if self.seen >= border {
+                let (mut before, mut behind) = (self.seen, t);
+                // Stops where neither is certain, or at a rounding.
+                for _ in 0..60 {
+                    change = 0.5 * (before + behind);
+                    match sign_at(change) {
+                        0 => break,
+                        s if s == sign => behind = change,
+                        _ => before = change,
+                    }
+                }
             }
+            self.changes[self.count] = change;
+            self.count += 1;
         }
-        self.last = sign;
-        self.equal_since = None;
+        (self.last, self.seen) = (sign, t);
     }
 
     fn order(self, lower_wins: bool) -> Order {

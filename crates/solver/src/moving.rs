@@ -46,7 +46,7 @@ use sightline_geometry::{gamma, motion::lerp};
 
 use crate::{
     arc::{Arc, Shape},
-    bernstein::{cubic_on, cubic_sign_changes, linear, quadratic, quadratic_on},
+    bernstein::{Polynomial, cubic_on, linear, quadratic, quadratic_on},
     bounds::ErrorBounds,
     envelope::{largest, least},
     quadratic::sign_changes,
@@ -449,7 +449,7 @@ impl<'a> MovingRow<'a> {
         borders.push(0.0);
         let (count, flat) = sign_changes(d[0], d[1], d[2]);
         flat[..count].iter().for_each(|&at| borders.push(at));
-        cubic_sign_changes(n, noise, |at| {
+        Polynomial::new(&n).sign_changes(noise, |at| {
             if borders.len < 7 {
                 borders.push(at);
             }

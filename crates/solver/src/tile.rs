@@ -115,6 +115,9 @@ struct Entry {
     corner: f64,
     first_bin: u8,
     last_bin: u8,
+    /// Rows that it can be seen in, of what moves.
+    first_row: u8,
+    end_row: u8,
     space: u32,
     node: u32,
 }
@@ -125,6 +128,12 @@ impl Entry {
     #[inline(always)]
     fn order(&self, other: &Self) -> Ordering {
         self.near.total_cmp(&other.near).then(self.corner.total_cmp(&other.corner))
+    }
+
+    /// True when it is hidden by what has these far depths.
+    #[inline(always)]
+    fn is_behind(&self, far: &Far) -> bool {
+        far.hides(self.near, self.first_bin, self.last_bin)
     }
 }
 
@@ -423,8 +432,16 @@ impl TileSolver {
     ) -> Option<Entry> {
         let scale = BINS as f64 / context.frame.length;
         let bin = |x: f64| ((x * scale) as usize).min(BINS - 1) as u8;
-        let entry =
-            Entry { near, corner: near, first_bin: bin(first), last_bin: bin(last), space, node };
+        let entry = Entry {
+            near,
+            corner: near,
+            first_bin: bin(first),
+            last_bin: bin(last),
+            first_row: 0,
+            end_row: 0,
+            space,
+            node,
+        };
         (!self.is_hidden(&entry)).then_some(entry)
     }
 
@@ -436,7 +453,7 @@ impl TileSolver {
             }
             self.tile_far = Far::of(self.row_far.iter().map(|far| &far.depths));
         }
-        self.tile_far.hides(entry.near, entry.first_bin, entry.last_bin)
+        entry.is_behind(&self.tile_far)
     }
 
     #[inline(always)]

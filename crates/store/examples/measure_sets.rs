@@ -52,6 +52,8 @@ fn main() -> Result<()> {
     let row = |id: u32| CellRow {
         cell: ViewCell { id: CellId(id), corners: [DVec3::ZERO; 4], height: 0.0 },
         tile: [id as i32, 0],
+        first_state: 0,
+        last_state: 0,
         set: street_cell(id),
         weights: Vec::new(),
         effort: CellEffort::default(),

@@ -18,13 +18,14 @@ async fn main() -> Result<()> {
     let open = |name: &str| BakeStore::open_or_create(&folder.join(name).to_string_lossy());
     let sample = Sample::golden();
 
-    let dataset = open("dataset-v2")?;
+    let dataset = open("dataset-v3")?;
     let manifest = sample.write(&dataset, Limits::default()).await;
     publish(&dataset, &manifest).await?;
 
-    let parts = open("parts-v2")?;
-    let (cells, pairs): (Vec<_>, Vec<_>) = sample.cells.into_iter().unzip();
+    let parts = open("parts-v3")?;
+    let cells = sample.all_rows();
+    let pairs: Vec<_> = sample.cells.into_iter().flat_map(|(_, pairs)| pairs).collect();
     parts.put_pointer("segments.parquet", encode_segment_part(&segments(16))?).await?;
     parts.put_pointer("cells.parquet", encode_cell_part(&cells)?).await?;
-    parts.put_pointer("objects.parquet", encode_object_part(&pairs.concat())?).await
+    parts.put_pointer("objects.parquet", encode_object_part(&pairs)?).await
 }

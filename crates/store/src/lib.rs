@@ -44,7 +44,7 @@ pub use publish::{Published, current, publish};
 pub use reader::Dataset;
 pub use rows::{
     CellEffort, CellEntry, CellRow, GltfTriangle, NumberedInstance, NumberedMesh, Numbering,
-    ObjectRow, ObjectsLocation, SceneObject, SegmentRow, SetLocation,
+    ObjectRow, ObjectsLocation, RowOrder, SceneObject, SegmentRow, SetLocation,
 };
 pub use verify::{CheckReport, Problem};
 pub use weight::Weight;

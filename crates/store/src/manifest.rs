@@ -2,7 +2,7 @@
 //!
 //! A manifest is a function of scene and configuration (ST-1): it holds no clock reading, host or
 //! absolute path, and not even its own number, so a second bake of the same input publishes
-//! nothing new. Format: `schemas/dataset-v2.md`.
+//! nothing new. Format: `schemas/dataset-v3.md`.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ use crate::{Result, StoreError, keys};
 /// Name of the dataset format.
 pub const FORMAT: &str = "sightline-dataset";
 /// Version of the dataset format that this crate writes. Those before it are read, too.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 /// Name of the pointer's format; it shares the dataset's version.
 const POINTER_FORMAT: &str = "sightline-pointer";
 
@@ -34,17 +34,32 @@ pub struct Manifest {
     pub config: Value,
     /// Hash of the configuration, as the bake computed it.
     pub config_hash: String,
+    /// Number of states; 1 before version 3.
+    #[serde(default = "one")]
+    pub states: u32,
+    /// Times of the key frames, seconds: one more than there are states, or a single one for a scene at
+    /// rest.
+    #[serde(default = "at_rest")]
+    pub key_times: Vec<f64>,
     /// Number of cells with a set.
     pub cells: u64,
     /// Cells without a set, by reason.
     pub skipped: BTreeMap<String, u64>,
-    /// Sums over all cells.
+    /// Sums over all rows.
     pub totals: Totals,
     /// Box around all cells, world space; absent when there are none.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub bounds: Option<BoxRecord>,
     /// The files, by kind, in cell order.
     pub files: Vec<DataFile>,
+}
+
+const fn one() -> u32 {
+    1
+}
+
+fn at_rest() -> Vec<f64> {
+    vec![0.0]
 }
 
 /// The scene that a dataset belongs to.
@@ -54,12 +69,26 @@ pub struct SceneSource {
     pub uri: String,
     /// Hash over all files of the scene, as the reader computed it.
     pub hash: String,
-    /// Number of primitives.
+    /// Number of triangles; primitives from this number on are particles.
     pub triangles: u64,
+    /// Number of particles; 0 before version 3.
+    #[serde(default)]
+    pub particles: u64,
+    /// Number of particle systems, which are the last objects; 0 before version 3.
+    #[serde(default)]
+    pub particle_systems: u64,
     /// Number of objects.
     pub objects: u64,
     /// The files of the scene.
     pub files: Vec<SceneFile>,
+}
+
+impl SceneSource {
+    /// Number of primitives: triangles and particles.
+    #[must_use]
+    pub const fn primitives(&self) -> u64 {
+        self.triangles.saturating_add(self.particles)
+    }
 }
 
 /// A file of the scene.
@@ -73,10 +102,13 @@ pub struct SceneFile {
     pub blake3: String,
 }
 
-/// Sums over all cells of a dataset.
+/// Sums over all rows of a dataset.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Totals {
-    /// Members of all sets.
+    /// Rows of cells: one a cell, and one a run of states where there are several; 0 before version 3.
+    #[serde(default)]
+    pub cell_rows: u64,
+    /// Members of the sets of all rows.
     pub primitives: u64,
     /// Encoded bytes of all sets, before compression.
     pub set_bytes: u64,
@@ -105,11 +137,11 @@ impl From<Bounds> for BoxRecord {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FileKind {
-    /// One row a cell, with its set.
+    /// One row a cell and run of states, with its set.
     Cells,
     /// One row a (cell, object).
     Objects,
-    /// One row a cell: where its rows lie.
+    /// One row a row of cells: where it lies.
     Index,
     /// One row an object.
     Scene,

@@ -1,7 +1,7 @@
-//! Parts: what tasks write while a bake runs. One Parquet object each, see `schemas/parts-v2.md`.
+//! Parts: what tasks write while a bake runs. One Parquet object each, see `schemas/parts-v3.md`.
 //!
-//! A segments task writes one file of [`SegmentRow`]s; a cells task writes one of [`CellRow`]s and
-//! one of [`ObjectRow`]s. Equal rows give equal bytes (ST-1), so attempts of one task agree.
+//! A segments task writes one file of [`SegmentRow`]s. A cells task writes one of [`CellRow`]s, and one
+//! of [`ObjectRow`]s where it takes all states; where it takes some, a join task writes both. Equal rows give equal bytes (ST-1), so attempts of one task agree.
 //! Encoders check the contract of the rows; decoders check what they read and name the file.
 
 use bytes::Bytes;
@@ -20,10 +20,11 @@ const OBJECT_BATCH_ROWS: usize = 4096;
 /// The file of a segments task.
 ///
 /// # Errors
-/// [`crate::StoreError::InvalidRows`] when segments are not in ascending order, or a row has not
-/// one finite weight a member of its set.
+/// [`crate::StoreError::InvalidRows`] when rows are not in ascending order of (segment, first state),
+/// or a row has no states, or not one finite weight a member of its set.
 pub fn encode_segment_part(rows: &[SegmentRow]) -> Result<Bytes> {
-    ascending(&SEGMENT_PART, rows.iter().map(|r| r.segment.0))?;
+    has_states(&SEGMENT_PART, rows.iter().map(|r| (r.first_state, r.last_state)))?;
+    ascending(&SEGMENT_PART, rows.iter().map(|r| (r.segment.0, r.first_state)))?;
     for row in rows {
         if row.weights.len() as u64 != row.set.len() {
             let (weights, members) = (row.weights.len(), row.set.len());
@@ -68,9 +69,11 @@ pub fn decode_segment_part_where(
 /// The cells file of a cells task.
 ///
 /// # Errors
-/// [`crate::StoreError::InvalidRows`] when cells are not in ascending order.
+/// [`crate::StoreError::InvalidRows`] when rows are not in ascending order of cells, each cell's
+/// longest first and equally long ones by time, or a row has no states.
 pub fn encode_cell_part(rows: &[CellRow]) -> Result<Bytes> {
-    ascending(&CELL_PART, rows.iter().map(|r| r.cell.id.0))?;
+    has_states(&CELL_PART, rows.iter().map(|r| (r.first_state, r.last_state)))?;
+    ascending(&CELL_PART, rows.iter().map(CellRow::order))?;
     CELL_PART.encode(rows.chunks(1).map(|row| cell_batch(&CELL_PART, row)))
 }
 
@@ -105,6 +108,14 @@ pub fn decode_object_part(file: &str, bytes: Bytes) -> Result<Vec<ObjectRow>> {
         rows.append(&mut object_rows(file, &batch?)?);
     }
     Ok(rows)
+}
+
+/// Checks pairs of a first and a last state.
+fn has_states(table: &Table, mut states: impl Iterator<Item = (u32, u32)>) -> Result<()> {
+    match states.find(|(first, last)| first > last || *last == u32::MAX) {
+        None => Ok(()),
+        Some((first, last)) => Err(table.invalid(format!("a row is of states {first} to {last}"))),
+    }
 }
 
 fn ascending<K: PartialOrd>(table: &Table, keys: impl Iterator<Item = K>) -> Result<()> {

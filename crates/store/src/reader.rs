@@ -20,7 +20,7 @@ use parquet::arrow::arrow_reader::{
 use parquet::arrow::push_decoder::ParquetPushDecoderBuilder;
 use parquet::errors::ParquetError;
 use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataPushDecoder};
-use sightline_geometry::CellId;
+use sightline_geometry::{CellId, StateSets, Timeline};
 
 use crate::manifest::{DataFile, FileKind, Manifest, Pointer, hash};
 use crate::publish::current;
@@ -32,12 +32,17 @@ use crate::tables::{
 use crate::{BakeStore, Result, StoreError, keys};
 
 /// A published dataset. Cells, index and manifest are those that were current when it was opened.
+///
+/// Invariants: `cells` has one entry a cell, ascending, of all states; `runs` has those of the runs of
+/// cells that have several, ascending by cell and time, and those of a cell take each state once.
 #[derive(Debug)]
 pub struct Dataset {
     store: BakeStore,
     pointer: Pointer,
     manifest: Manifest,
-    index: Vec<CellEntry>,
+    timeline: Timeline,
+    cells: Vec<CellEntry>,
+    runs: Vec<CellEntry>,
     footers: Mutex<HashMap<String, Arc<ArrowReaderMetadata>>>,
 }
 
@@ -52,22 +57,32 @@ impl Dataset {
         let Some((pointer, manifest)) = current(store).await? else {
             return Err(not_a_dataset(store).await);
         };
-        let mut index = Vec::new();
+        let manifest_name = keys::manifest(pointer.manifest);
+        let timeline = Timeline::new(manifest.key_times.clone())
+            .map_err(|problem| StoreError::corrupt(&manifest_name, problem))?;
+        if timeline.states() != manifest.states {
+            let problem = format!("its key frames do not have {} states between", manifest.states);
+            return Err(StoreError::corrupt(&manifest_name, problem));
+        }
+        let mut index: Vec<CellEntry> = Vec::new();
         for file in manifest.files_of(FileKind::Index) {
             let bytes = verified(store, file).await?;
             for batch in INDEX.decode(&file.name, bytes)? {
                 index.append(&mut index_rows(&file.name, &batch?)?);
             }
-            if !index.is_sorted_by(|a, b| a.cell.id < b.cell.id) {
+            if !index.is_sorted_by(|a, b| a.order() < b.order()) {
                 return Err(StoreError::corrupt(&file.name, "cells are not in ascending order"));
             }
         }
-        if index.len() as u64 != manifest.cells {
-            let (cells, rows) = (manifest.cells, index.len());
-            let problem = format!("it counts {cells} cells, and the index has {rows}");
-            return Err(StoreError::corrupt(&keys::manifest(pointer.manifest), problem));
+        let (cells, runs) = split_index(index, timeline.states())
+            .map_err(|problem| StoreError::corrupt(&manifest_name, problem))?;
+        if cells.len() as u64 != manifest.cells {
+            let (counted, found) = (manifest.cells, cells.len());
+            let problem = format!("it counts {counted} cells, and the index has {found}");
+            return Err(StoreError::corrupt(&manifest_name, problem));
         }
-        Ok(Self { store: store.clone(), pointer, manifest, index, footers: Mutex::default() })
+        let (store, footers) = (store.clone(), Mutex::default());
+        Ok(Self { store, pointer, manifest, timeline, cells, runs, footers })
     }
 
     /// Number of the manifest that was current.
@@ -88,33 +103,89 @@ impl Dataset {
         &self.store
     }
 
-    /// The index: all cells without their sets, in ascending order.
+    /// When the states of the scene are.
     #[must_use]
-    pub fn cells(&self) -> &[CellEntry] {
-        &self.index
+    pub fn timeline(&self) -> &Timeline {
+        &self.timeline
     }
 
-    /// The index row of a cell.
+    /// Number of states of the scene; 1 for one at rest.
+    #[must_use]
+    pub fn states(&self) -> u32 {
+        self.timeline.states()
+    }
+
+    /// The index: all cells without their sets, in ascending order; of each, the entry of all states.
+    #[must_use]
+    pub fn cells(&self) -> &[CellEntry] {
+        &self.cells
+    }
+
+    /// The index row of a cell, of all states.
     #[must_use]
     pub fn entry(&self, cell: CellId) -> Option<&CellEntry> {
-        let found = self.index.binary_search_by_key(&cell, |entry| entry.cell.id);
-        found.ok().map(|k| &self.index[k])
+        let found = self.cells.binary_search_by_key(&cell, |entry| entry.cell.id);
+        found.ok().map(|k| &self.cells[k])
+    }
+
+    /// The index rows of a cell's runs of states, by time: its only row where nothing changes. Empty
+    /// for a cell that does not exist.
+    #[must_use]
+    pub fn runs(&self, cell: CellId) -> &[CellEntry] {
+        let from = self.runs.partition_point(|entry| entry.cell.id < cell);
+        let end = from + self.runs[from..].partition_point(|entry| entry.cell.id == cell);
+        if from < end {
+            return &self.runs[from..end];
+        }
+        self.entry(cell).map_or(&[], std::slice::from_ref)
     }
 
     /// The cell that a point is in; the one with the lowest number where cells touch. Looks at the
     /// boxes of all cells.
     #[must_use]
     pub fn cell_at(&self, point: DVec3) -> Option<CellId> {
-        self.index.iter().find(|entry| entry.cell.contains(point)).map(|entry| entry.cell.id)
+        self.cells.iter().find(|entry| entry.cell.contains(point)).map(|entry| entry.cell.id)
     }
 
-    /// A cell with its set. Reads the cell's pages only.
+    /// A cell with the set of all states: what is visible in any of them. Reads its pages only.
     ///
     /// # Errors
     /// [`StoreError::NotFound`] when the dataset has no such cell, [`StoreError::Corrupt`] with the
     /// damaged or missing file, or what the store reports.
     pub async fn cell(&self, cell: CellId) -> Result<CellRow> {
-        let place = &self.known(cell)?.set;
+        self.row(self.known(cell)?).await
+    }
+
+    /// A cell with the set of the run of states that holds `state`. Reads its pages only.
+    ///
+    /// # Errors
+    /// As [`Dataset::cell`]; [`StoreError::NotFound`] also when the scene has no such state.
+    pub async fn cell_in_state(&self, cell: CellId, state: u32) -> Result<CellRow> {
+        self.known(cell)?;
+        let run = self.runs(cell).iter().find(|run| run.states().contains(&state));
+        let run = run.ok_or_else(|| StoreError::NotFound {
+            key: format!("state {state} of cell {cell}"),
+            location: self.store.location().to_owned(),
+        })?;
+        self.row(run).await
+    }
+
+    /// The sets of a cell, by runs of states. Reads their pages only.
+    ///
+    /// # Errors
+    /// As [`Dataset::cell`].
+    pub async fn state_sets(&self, cell: CellId) -> Result<StateSets> {
+        self.known(cell)?;
+        let mut runs = Vec::new();
+        for entry in self.runs(cell) {
+            runs.push((entry.states(), self.row(entry).await?.set));
+        }
+        Ok(StateSets::from_runs(runs))
+    }
+
+    /// The row of an index entry.
+    async fn row(&self, entry: &CellEntry) -> Result<CellRow> {
+        let place = &entry.set;
         let selection =
             RowSelection::from(vec![RowSelector::skip(place.row as usize), RowSelector::select(1)]);
         let rows = self
@@ -126,9 +197,9 @@ impl Dataset {
             .await?;
         let rows: Result<Vec<_>> = rows.iter().map(|b| cell_rows(&place.file, b)).collect();
         match rows?.into_iter().flatten().next() {
-            Some(row) if row.cell.id == cell => Ok(row),
+            Some(row) if row.order() == entry.order() => Ok(row),
             _ => {
-                let problem = format!("cell {cell} is not where the index says");
+                let problem = format!("cell {} is not where the index says", entry.cell.id);
                 Err(StoreError::corrupt(&place.file, problem))
             }
         }
@@ -163,7 +234,8 @@ impl Dataset {
         Ok(rows)
     }
 
-    /// All cells with their sets, in ascending order. Reads whole files, one after the other.
+    /// All rows of cells with their sets, in ascending order: of each cell that of all states first,
+    /// then those of its runs, the longest first. Reads whole files, one after the other.
     pub fn cell_rows(&self) -> impl Stream<Item = Result<CellRow>> + '_ {
         self.rows_of(FileKind::Cells, &CELLS, cell_rows)
     }
@@ -282,6 +354,29 @@ impl Dataset {
         lock().insert(file.name.clone(), Arc::clone(&footer));
         Ok(footer)
     }
+}
+
+/// Tells entries of all states, one a cell, from those of runs; the latter by time.
+fn split_index(
+    index: Vec<CellEntry>,
+    states: u32,
+) -> Result<(Vec<CellEntry>, Vec<CellEntry>), String> {
+    let (cells, mut runs): (Vec<_>, Vec<_>) =
+        index.into_iter().partition(|entry| entry.states() == (0..states));
+    runs.sort_by_key(|entry| (entry.cell.id, entry.first_state));
+    let mut known = cells.iter();
+    for own in runs.chunk_by(|a, b| a.cell.id == b.cell.id) {
+        let id = own[0].cell.id;
+        if !known.any(|entry| entry.cell.id == id) {
+            return Err(format!("the index has no row of all states of cell {id}"));
+        }
+        let meet = own.windows(2).all(|pair| pair[0].states().end == pair[1].first_state);
+        let (first, last) = (own[0].first_state, own[own.len() - 1].last_state);
+        if !meet || (first, last) != (0, states - 1) {
+            return Err(format!("the index does not take each state of cell {id} once"));
+        }
+    }
+    Ok((cells, runs))
 }
 
 /// The bytes of a file of the dataset, verified.

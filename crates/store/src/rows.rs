@@ -1,4 +1,11 @@
 //! The rows that writers take and readers give. Plain data; the tables are in [`crate::tables`].
+//!
+//! What a cell or a segment sees changes with the state where something moves. A row says what is seen
+//! in a *run* of consecutive states with equal sets, `first_state..=last_state`. A cell that has several
+//! runs has a row of their union beside them.
+
+use std::cmp::Reverse;
+use std::ops::Range;
 
 use sightline_geometry::{
     Bounds, CellId, MeshId, ObjectId, PrimitiveId, PrimitiveSet, SegmentId, ViewCell,
@@ -6,11 +13,15 @@ use sightline_geometry::{
 
 use crate::Weight;
 
-/// What one view segment sees.
+/// What one view segment sees in a run of states.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SegmentRow {
     /// The segment's number in the plan.
     pub segment: SegmentId,
+    /// First state of the run; 0 in scenes at rest.
+    pub first_state: u32,
+    /// Last state of the run; 0 in scenes at rest.
+    pub last_state: u32,
     /// The visible primitives.
     pub set: PrimitiveSet,
     /// One weight a member, in ascending order of the members: the share of (solid angle x
@@ -20,17 +31,30 @@ pub struct SegmentRow {
     pub rays: u64,
 }
 
-/// What one view cell sees, and how well that was established.
+impl SegmentRow {
+    /// The states of the run.
+    #[must_use]
+    pub const fn states(&self) -> Range<u32> {
+        self.first_state..self.last_state + 1
+    }
+}
+
+/// What one view cell sees in a run of states or in any state, and how well that was established.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellRow {
     /// The cell.
     pub cell: ViewCell,
     /// Tile of the view region, (x, z).
     pub tile: [i32; 2],
+    /// First state of the row; 0 in scenes at rest.
+    pub first_state: u32,
+    /// Last state of the row; 0 in scenes at rest.
+    pub last_state: u32,
     /// The visible primitives.
     pub set: PrimitiveSet,
-    /// One weight a member, in ascending order of the members: the mean over the cell's segments,
-    /// by length, of the share of (solid angle x segment) on which the member is nearest.
+    /// One weight a member, in ascending order of the members: the mean over the states of the row, by
+    /// duration, and over the cell's segments, by length, of the share of (solid angle x segment) on
+    /// which the member is nearest.
     pub weights: Vec<Weight>,
     /// What was solved, and what was measured.
     pub effort: CellEffort,
@@ -86,7 +110,28 @@ impl Default for CellEffort {
     }
 }
 
+/// Where a row stands in a table of cells: by cell, the longest first, then by time. So the union of all
+/// states comes before the runs.
+pub type RowOrder = (CellId, Reverse<u32>, u32);
+
+/// See [`RowOrder`].
+pub(crate) const fn row_order(cell: CellId, states: &Range<u32>) -> RowOrder {
+    (cell, Reverse(states.end - states.start), states.start)
+}
+
 impl CellRow {
+    /// The states of the row.
+    #[must_use]
+    pub const fn states(&self) -> Range<u32> {
+        self.first_state..self.last_state + 1
+    }
+
+    /// Where the row stands in a table: rows are written in this order.
+    #[must_use]
+    pub const fn order(&self) -> RowOrder {
+        row_order(self.cell.id, &self.states())
+    }
+
     /// The members with their weights, the most important first; among equal weights the lower
     /// primitive number. Members without a measured weight come last.
     #[must_use]
@@ -107,7 +152,7 @@ impl CellRow {
     }
 }
 
-/// How much of one object a cell sees.
+/// How much of one object a cell sees, in any state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ObjectRow {
     /// The cell.
@@ -242,19 +287,36 @@ impl Numbering {
     }
 }
 
-/// What the index says of a cell: everything but its set, and where that is.
+/// What the index says of a cell's row: everything but its set, and where that is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellEntry {
     /// The cell.
     pub cell: ViewCell,
     /// Tile of the view region, (x, z).
     pub tile: [i32; 2],
+    /// First state of the row; 0 in scenes at rest.
+    pub first_state: u32,
+    /// Last state of the row; 0 in scenes at rest.
+    pub last_state: u32,
     /// Number of visible primitives.
     pub primitives: u32,
     /// Where the cell's row lies.
     pub set: SetLocation,
     /// Where the cell's (cell, object) rows lie.
     pub objects: ObjectsLocation,
+}
+
+impl CellEntry {
+    /// The states of the row.
+    #[must_use]
+    pub const fn states(&self) -> Range<u32> {
+        self.first_state..self.last_state + 1
+    }
+
+    /// Where the row stands in a table.
+    pub(crate) const fn order(&self) -> RowOrder {
+        row_order(self.cell.id, &self.states())
+    }
 }
 
 /// Where a cell's row, and the page with its set, lie.

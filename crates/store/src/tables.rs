@@ -84,8 +84,9 @@ pub(crate) struct Table {
     pub format: &'static str,
     /// Version of the format that is written.
     pub version: u32,
-    /// Columns that version 1 did not have, in a table of version 2 whose version 1 is still read.
-    pub added: &'static [&'static str],
+    /// Columns that a version added to the one before it, in a table whose earlier versions are still
+    /// read.
+    pub added: &'static [(u32, &'static [&'static str])],
     /// Rows in a row group.
     pub row_group_rows: usize,
     /// The columns, in the order of the file.
@@ -109,6 +110,12 @@ const CELL_COLUMNS: &[Column] = &[
     ("corner3_y", Kind::F64, "metres"),
     ("corner3_z", Kind::F64, "metres"),
     ("height", Kind::F64, "from the lower to the upper eye height, metres"),
+    (
+        "first_state",
+        Kind::U32,
+        "first state of the row; a row of all states holds what any state sees",
+    ),
+    ("last_state", Kind::U32, "last state of the row"),
     ("primitives", Kind::U32, "number of visible primitives"),
     ("segments", Kind::U32, "view segments solved for the cell"),
     ("runs", Kind::U32, "of these, runs along the perimeter"),
@@ -138,14 +145,19 @@ const CELL_COLUMNS_OF_2: &[&str] = &[
     "weights",
 ];
 
+/// Columns of [`CELL_COLUMNS`] and of the index that version 2 did not have.
+const STATE_COLUMNS: &[&str] = &["first_state", "last_state"];
+
 /// What segments tasks write.
 pub(crate) const SEGMENT_PART: Table = Table {
     format: "sightline-part-segments",
-    version: 2,
+    version: 3,
     added: &[],
     row_group_rows: 64,
     columns: &[
         ("segment", Kind::U32, "number of the view segment in the plan"),
+        ("first_state", Kind::U32, "first state of the row"),
+        ("last_state", Kind::U32, "last state of the row"),
         ("primitives", Kind::U32, "number of visible primitives"),
         (
             "set",
@@ -165,7 +177,7 @@ pub(crate) const SEGMENT_PART: Table = Table {
 /// What cells tasks write: cells.
 pub(crate) const CELL_PART: Table = Table {
     format: "sightline-part-cells",
-    version: 2,
+    version: 3,
     added: &[],
     row_group_rows: 1024,
     columns: CELL_COLUMNS,
@@ -188,12 +200,12 @@ pub(crate) const OBJECT_PART: Table = Table {
     ],
 };
 
-/// `data/cells-*`: one row a cell. 1,024 rows a row group keep a footer entry per 1,024 cells and
+/// `data/cells-*`: one row a cell and run of states, and one of all. 1,024 rows a row group keep a footer entry per 1,024 cells and
 /// let an engine read groups in parallel; the sets are in pages of their own whatever the group.
 pub(crate) const CELLS: Table = Table {
     format: "sightline-cells",
-    version: 2,
-    added: CELL_COLUMNS_OF_2,
+    version: 3,
+    added: &[(2, CELL_COLUMNS_OF_2), (3, STATE_COLUMNS)],
     row_group_rows: 1024,
     columns: CELL_COLUMNS,
 };
@@ -216,11 +228,11 @@ pub(crate) const OBJECTS: Table = Table {
     ],
 };
 
-/// `data/index-*`: one row a cell, small, fetched first.
+/// `data/index-*`: one row a row of the cells, small, fetched first.
 pub(crate) const INDEX: Table = Table {
     format: "sightline-index",
-    version: 2,
-    added: &["weights_offset", "weights_bytes"],
+    version: 3,
+    added: &[(2, &["weights_offset", "weights_bytes"]), (3, STATE_COLUMNS)],
     row_group_rows: 1 << 16,
     columns: &[
         ("cell", Kind::U32, "number of the view cell, in Hilbert order"),
@@ -245,6 +257,8 @@ pub(crate) const INDEX: Table = Table {
         ("corner3_y", Kind::F64, "metres"),
         ("corner3_z", Kind::F64, "metres"),
         ("height", Kind::F64, "from the lower to the upper eye height, metres"),
+        ("first_state", Kind::U32, "first state of the row"),
+        ("last_state", Kind::U32, "last state of the row"),
         ("primitives", Kind::U32, "number of visible primitives"),
         ("cells_file", Kind::Text, "key of the file with the cell's row"),
         ("row_group", Kind::U32, "row group in the cells file"),
@@ -414,7 +428,7 @@ impl Table {
         let oldest = if self.added.is_empty() { self.version } else { 1 };
         match value(VERSION_KEY).parse::<u64>() {
             Ok(version) if (u64::from(oldest)..=u64::from(self.version)).contains(&version) => {
-                self.expect_columns(file, metadata, version < u64::from(self.version))
+                self.expect_columns(file, metadata, version)
             }
             Ok(found) => {
                 let supported = self.version;
@@ -424,9 +438,18 @@ impl Table {
         }
     }
 
-    fn expect_columns(&self, file: &str, metadata: &ArrowReaderMetadata, old: bool) -> Result<()> {
+    fn expect_columns(
+        &self,
+        file: &str,
+        metadata: &ArrowReaderMetadata,
+        version: u64,
+    ) -> Result<()> {
+        let later = |name: &str| {
+            let mut later = self.added.iter().filter(|(since, _)| u64::from(*since) > version);
+            later.any(|(_, columns)| columns.contains(&name))
+        };
         for field in self.schema().fields() {
-            if old && self.added.contains(&field.name().as_str()) {
+            if later(field.name()) {
                 continue;
             }
             let found = metadata.schema().field_with_name(field.name());
@@ -579,6 +602,8 @@ pub(crate) fn segment_batch(row: &SegmentRow) -> Result<RecordBatch> {
     weights.append(true);
     SEGMENT_PART.batch(vec![
         numbers::<UInt32Type>([row.segment.0].into_iter()),
+        numbers::<UInt32Type>([row.first_state].into_iter()),
+        numbers::<UInt32Type>([row.last_state].into_iter()),
         numbers::<UInt32Type>([count(&row.set)].into_iter()),
         sets([&row.set].into_iter()),
         Arc::new(weights.finish()),
@@ -595,6 +620,8 @@ pub(crate) fn cell_batch(table: &Table, rows: &[CellRow]) -> Result<RecordBatch>
     ];
     columns.extend(cell_geometry(rows.iter().map(|r| &r.cell)));
     columns.extend([
+        numbers::<UInt32Type>(rows.iter().map(|r| r.first_state)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.last_state)),
         numbers::<UInt32Type>(rows.iter().map(|r| count(&r.set))),
         numbers::<UInt32Type>(rows.iter().map(|r| r.effort.segments)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.effort.runs)),
@@ -645,6 +672,8 @@ pub(crate) fn index_batch(rows: &[CellEntry]) -> Result<RecordBatch> {
     columns.extend(boxes(rows.iter().map(|r| r.cell.bounds())));
     columns.extend(cell_geometry(rows.iter().map(|r| &r.cell)));
     columns.extend([
+        numbers::<UInt32Type>(rows.iter().map(|r| r.first_state)),
+        numbers::<UInt32Type>(rows.iter().map(|r| r.last_state)),
         numbers::<UInt32Type>(rows.iter().map(|r| r.primitives)),
         texts(rows.iter().map(|r| r.set.file.as_str())),
         numbers::<UInt32Type>(rows.iter().map(|r| r.set.row_group)),
@@ -724,6 +753,25 @@ impl<'a> Columns<'a> {
         self.batch.column_by_name(name).is_some()
     }
 
+    /// The first and the last state of each row; all 0 in versions that had no states.
+    fn states(&self) -> Result<impl Fn(usize) -> Result<[u32; 2]>> {
+        let columns = if self.has("first_state") {
+            Some((self.u32s("first_state")?, self.u32s("last_state")?))
+        } else {
+            None
+        };
+        let file = self.file;
+        Ok(move |row: usize| {
+            let Some((first, last)) = columns else { return Ok([0, 0]) };
+            let (first, last) = (first[row], last[row]);
+            if first > last || last == u32::MAX {
+                let problem = format!("a row is of the states {first} to {last}");
+                return Err(StoreError::corrupt(file, problem));
+            }
+            Ok([first, last])
+        })
+    }
+
     /// A column that version 1 did not have; `expect` has seen to it that later versions do.
     fn added<T: 'static>(&self, name: &str) -> Result<Option<&'a T>> {
         self.has(name).then(|| self.get(name)).transpose()
@@ -798,6 +846,7 @@ pub(crate) fn segment_rows(
     let sets = columns.get::<BinaryArray>("set")?;
     let weights = columns.get::<ListArray>("weights")?;
     let rays = columns.numbers::<UInt64Type>("rays")?;
+    let states = columns.states()?;
     for (row, &id) in ids.iter().enumerate() {
         let segment = SegmentId(id);
         if !wanted(segment) {
@@ -811,7 +860,8 @@ pub(crate) fn segment_rows(
             let problem = format!("segment {segment} has not one weight a primitive");
             return Err(StoreError::corrupt(file, problem));
         }
-        rows.push(SegmentRow { segment, set, weights, rays: rays[row] });
+        let [first_state, last_state] = states(row)?;
+        rows.push(SegmentRow { segment, first_state, last_state, set, weights, rays: rays[row] });
     }
     Ok(())
 }
@@ -824,13 +874,15 @@ pub(crate) fn cell_rows(file: &str, batch: &RecordBatch) -> Result<Vec<CellRow>>
     let sets = columns.get::<BinaryArray>("set")?;
     let weights = columns.added::<BinaryArray>("weights")?;
     let efforts = cell_efforts(&columns)?;
+    let states = columns.states()?;
     let row = |((row, cell), effort): ((usize, ViewCell), CellEffort)| {
         let set = columns.set(sets, sizes, row)?;
         let weights = match weights {
             Some(weights) => weights.value(row).iter().copied().map(Weight::from_code).collect(),
             None => vec![Weight::UNMEASURED; sizes[row] as usize],
         };
-        Ok(CellRow { cell, tile: [tile_x[row], tile_z[row]], set, weights, effort })
+        let ([first_state, last_state], tile) = (states(row)?, [tile_x[row], tile_z[row]]);
+        Ok(CellRow { cell, tile, first_state, last_state, set, weights, effort })
     };
     columns.cells()?.into_iter().enumerate().zip(efforts).map(row).collect()
 }
@@ -911,27 +963,33 @@ pub(crate) fn index_rows(file: &str, batch: &RecordBatch) -> Result<Vec<CellEntr
     let objects_files = columns.get::<StringArray>("objects_file")?;
     let first_rows = columns.u32s("objects_first_row")?;
     let row_counts = columns.u32s("objects_rows")?;
-    let entry = |(row, cell): (usize, ViewCell)| CellEntry {
-        cell,
-        tile: [tile_x[row], tile_z[row]],
-        primitives: primitives[row],
-        set: SetLocation {
-            file: cells_files.value(row).to_owned(),
-            row_group: row_groups[row],
-            row: rows[row],
-            page_offset: page_offsets[row],
-            page_bytes: page_bytes[row],
-            page_row: page_rows[row],
-            weights_offset: weights_offsets.map_or(0, |offsets| offsets[row]),
-            weights_bytes: weights_bytes.map_or(0, |bytes| bytes[row]),
-        },
-        objects: ObjectsLocation {
-            file: objects_files.value(row).to_owned(),
-            first_row: first_rows[row],
-            rows: row_counts[row],
-        },
+    let states = columns.states()?;
+    let entry = |(row, cell): (usize, ViewCell)| {
+        let [first_state, last_state] = states(row)?;
+        Ok(CellEntry {
+            cell,
+            tile: [tile_x[row], tile_z[row]],
+            first_state,
+            last_state,
+            primitives: primitives[row],
+            set: SetLocation {
+                file: cells_files.value(row).to_owned(),
+                row_group: row_groups[row],
+                row: rows[row],
+                page_offset: page_offsets[row],
+                page_bytes: page_bytes[row],
+                page_row: page_rows[row],
+                weights_offset: weights_offsets.map_or(0, |offsets| offsets[row]),
+                weights_bytes: weights_bytes.map_or(0, |bytes| bytes[row]),
+            },
+            objects: ObjectsLocation {
+                file: objects_files.value(row).to_owned(),
+                first_row: first_rows[row],
+                rows: row_counts[row],
+            },
+        })
     };
-    Ok(columns.cells()?.into_iter().enumerate().map(entry).collect())
+    columns.cells()?.into_iter().enumerate().map(entry).collect()
 }
 
 pub(crate) fn scene_rows(file: &str, batch: &RecordBatch) -> Result<Vec<SceneObject>> {

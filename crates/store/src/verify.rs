@@ -12,7 +12,9 @@ use crate::reader::verified;
 use crate::rows::{CellEntry, CellRow, ObjectRow, SceneObject};
 use crate::tables::{CELLS, INDEX, INSTANCES, MESHES, OBJECTS, SCENE, Table, count};
 use crate::tables::{cell_rows, object_rows};
-use crate::writer::{check_cell, check_objects, check_pairs, check_weights};
+use crate::writer::{
+    check_cell, check_objects, check_pair_states, check_pairs, check_runs, check_weights,
+};
 use crate::{BakeStore, Dataset, Result, StoreError, keys};
 
 /// What is wrong with a file.
@@ -79,7 +81,8 @@ impl Dataset {
         let Some(found) = report.note(found)? else { return Ok(report) };
         if let Some((pointer, manifest)) = &found {
             report.files = 2;
-            report.bytes = store.size(keys::POINTER).await? + manifest.to_bytes().len() as u64;
+            let manifest_size = store.size(&keys::manifest(pointer.manifest)).await?;
+            report.bytes = store.size(keys::POINTER).await? + manifest_size;
             let sum = manifest.files.iter().map(|f| f.bytes).sum::<u64>();
             if sum != manifest.totals.file_bytes {
                 let name = keys::manifest(pointer.manifest);
@@ -110,15 +113,28 @@ impl Dataset {
             }
         };
         let scene = &self.manifest().scene;
-        if (scene.triangles, scene.objects) != (primitives, objects.len() as u64) {
-            report.broken(&manifest_name, "it counts other triangles or objects than the scene");
+        let counted = scene.triangles.checked_add(scene.particles);
+        if (counted, scene.objects) != (Some(primitives), objects.len() as u64) {
+            report.broken(&manifest_name, "it counts other primitives or objects than the scene");
         }
-        if let Err(problem) = self.numbering().await?.check(primitives) {
+        if let Err(problem) = self.numbering().await?.check(scene.triangles) {
             report.broken(first_file(self, FileKind::Numbering), problem);
         }
         self.check_cells(&objects, primitives, report).await?;
         let totals = self.manifest().totals;
-        let listed: u64 = self.cells().iter().map(|e| u64::from(e.primitives)).sum();
+        let (mut rows, mut listed) = (0, 0);
+        for cell in self.cells() {
+            // A cell with one run has one row.
+            let runs = self.runs(cell.cell.id);
+            let more = if runs.len() > 1 { runs } else { &[] };
+            rows += 1 + more.len() as u64;
+            listed +=
+                std::iter::once(cell).chain(more).map(|e| u64::from(e.primitives)).sum::<u64>();
+        }
+        // Versions before 3 had one row a cell, and did not count them.
+        if self.manifest().version > 2 && totals.cell_rows != rows {
+            report.broken(&manifest_name, "its number of rows is not that of the index");
+        }
         let pairs: u64 = self.cells().iter().map(|e| u64::from(e.objects.rows)).sum();
         if (totals.primitives, totals.object_rows) != (listed, pairs) {
             report.broken(&manifest_name, "its totals differ from the sums over the cells");
@@ -133,26 +149,37 @@ impl Dataset {
         primitives: u64,
         report: &mut CheckReport,
     ) -> Result<()> {
-        // Version 1 had no weights.
-        let weighed = self.manifest().version > 1;
-        let mut entries = self.cells().iter();
+        let mut next_cell = 0;
         let mut pairs = std::pin::pin!(self.all_object_rows());
         let mut next_pair = pairs.try_next().await?;
-        let mut cells = std::pin::pin!(self.cell_rows());
-        while let Some(row) = cells.try_next().await? {
-            let Some(entry) = entries.next() else {
+        let mut stream = std::pin::pin!(self.cell_rows());
+        let mut next_row = stream.try_next().await?;
+        while let Some(first) = next_row.take() {
+            let id = first.cell.id;
+            let mut rows = vec![first];
+            next_row = stream.try_next().await?;
+            while let Some(row) = next_row.take_if(|row| row.cell.id == id) {
+                rows.push(row);
+                next_row = stream.try_next().await?;
+            }
+            let Some(entry) = self.cells().get(next_cell) else {
                 report.broken(first_file(self, FileKind::Index), "cells are missing in it");
                 return Ok(());
             };
+            next_cell += 1;
             let mut own = Vec::new();
-            while let Some(pair) = next_pair.filter(|pair| pair.cell <= row.cell.id) {
+            while let Some(pair) = next_pair.filter(|pair| pair.cell <= id) {
                 own.push(pair);
                 next_pair = pairs.try_next().await?;
             }
-            check_row(&row, entry, &own, objects, primitives, weighed, report);
+            let runs = self.runs(entry.cell.id);
+            let found = Found { rows: &rows, pairs: &own, entry, runs };
+            // Version 1 had no weights.
+            let weighed = self.manifest().version > 1;
+            found.check(objects, primitives, self.states(), weighed, report);
             report.cells += 1;
         }
-        if entries.next().is_some() || next_pair.is_some() {
+        if next_cell < self.cells().len() || next_pair.is_some() {
             report
                 .broken(first_file(self, FileKind::Cells), "cells of the index are missing in it");
         }
@@ -160,34 +187,59 @@ impl Dataset {
     }
 }
 
-fn check_row(
-    row: &CellRow,
-    entry: &CellEntry,
-    pairs: &[ObjectRow],
-    objects: &[SceneObject],
-    primitives: u64,
-    weighed: bool,
-    report: &mut CheckReport,
-) {
-    if let Err(problem) = check_cell(row, primitives) {
-        report.broken(&entry.set.file, problem);
-    }
-    match check_pairs(row, pairs, objects) {
-        Err(problem) => report.broken(&entry.objects.file, problem),
-        Ok(()) if !weighed => {}
-        Ok(()) => {
-            if let Err(problem) = check_weights(row, pairs, objects) {
-                report.broken(&entry.set.file, problem);
+/// What the files of a dataset have of one cell.
+struct Found<'a> {
+    /// Its rows, at least one.
+    rows: &'a [CellRow],
+    pairs: &'a [ObjectRow],
+    /// The index entry of all states.
+    entry: &'a CellEntry,
+    /// Those of its runs by time; the same where there is one.
+    runs: &'a [CellEntry],
+}
+
+impl Found<'_> {
+    fn check(
+        &self,
+        objects: &[SceneObject],
+        primitives: u64,
+        states: u32,
+        weighed: bool,
+        report: &mut CheckReport,
+    ) {
+        let Self { rows, pairs, entry, runs } = *self;
+        let union = &rows[0];
+        let of_cells = rows.iter().try_for_each(|row| check_cell(row, primitives));
+        if let Err(problem) = of_cells.and_then(|()| check_runs(rows, states)) {
+            report.broken(&entry.set.file, problem);
+            return;
+        }
+        let of_pairs = check_pairs(union, pairs, objects);
+        match of_pairs.and_then(|()| check_pair_states(rows, pairs, objects)) {
+            Err(problem) => report.broken(&entry.objects.file, problem),
+            Ok(()) if !weighed => {}
+            Ok(()) => {
+                if let Err(problem) = check_weights(union, pairs, objects) {
+                    report.broken(&entry.set.file, problem);
+                }
             }
         }
-    }
-    let agrees = entry.cell == row.cell
-        && entry.tile == row.tile
-        && entry.primitives == count(&row.set)
-        && entry.objects.rows as usize == pairs.len();
-    if !agrees {
-        let problem = format!("the index and the row of cell {} differ", row.cell.id);
-        report.broken(&entry.set.file, problem);
+        let listed = if runs.len() > 1 { runs.len() + 1 } else { 1 };
+        let agrees = |entry: &CellEntry, row: &CellRow| {
+            entry.cell == row.cell
+                && entry.tile == row.tile
+                && entry.states() == row.states()
+                && entry.primitives == count(&row.set)
+                && entry.objects.rows as usize == pairs.len()
+        };
+        let mut behind = rows.iter().skip(1);
+        let all_agree = listed == rows.len()
+            && agrees(entry, union)
+            && behind.all(|row| runs.iter().any(|entry| agrees(entry, row)));
+        if !all_agree {
+            let problem = format!("the index and the rows of cell {} differ", union.cell.id);
+            report.broken(&entry.set.file, problem);
+        }
     }
 }
 
@@ -270,6 +322,8 @@ mod tests {
         let row = CellRow {
             cell: cell.clone(),
             tile: [0, 0],
+            first_state: 0,
+            last_state: 0,
             set: PrimitiveSet::from_sorted([1, 2, 4]),
             weights: weights.iter().map(|w| Weight::from_share(*w)).collect(),
             effort: CellEffort::default(),
@@ -286,7 +340,15 @@ mod tests {
         };
         let objects_at =
             ObjectsLocation { file: "data/objects-x.parquet".into(), first_row: 0, rows: 1 };
-        let entry = CellEntry { cell, tile: [0, 0], primitives: 3, set, objects: objects_at };
+        let entry = CellEntry {
+            cell,
+            tile: [0, 0],
+            first_state: 0,
+            last_state: 0,
+            primitives: 3,
+            set,
+            objects: objects_at,
+        };
         let pair = ObjectRow {
             cell: CellId(7),
             object: ObjectId(0),
@@ -307,7 +369,9 @@ mod tests {
             bounds: Bounds::EMPTY,
         };
         let mut report = CheckReport::default();
-        check_row(&row, &entry, &[pair], &[object], 5, true, &mut report);
+        let runs = std::slice::from_ref(&entry);
+        let found = Found { rows: &[row], pairs: &[pair], entry: &entry, runs };
+        found.check(&[object], 5, 1, true, &mut report);
         report.problems
     }
 

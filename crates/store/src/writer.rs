@@ -1,6 +1,6 @@
 //! From rows to the files of a dataset.
 //!
-//! Cells come in ascending order, each with its (cell, object) rows, and stream into files that
+//! Cells come in ascending order, each with the rows of its states and its (cell, object) rows, and stream into files that
 //! are stored as soon as they are full: memory holds one open file a kind and the index. Where
 //! files and row groups end depends on the rows alone (ST-1). Nothing is visible to readers before
 //! [`crate::publish`].
@@ -14,7 +14,7 @@ use bytes::Bytes;
 use parquet::arrow::arrow_writer::ArrowWriter;
 use parquet::file::metadata::{PageIndexPolicy, ParquetMetaDataReader};
 use serde_json::Value;
-use sightline_geometry::{Bounds, CellId};
+use sightline_geometry::{Bounds, CellId, PrimitiveSet, Timeline};
 
 use crate::manifest::{
     DataFile, FORMAT, FileKind, Manifest, SceneSource, Totals, VERSION, hash, sorted,
@@ -30,7 +30,7 @@ use crate::{BakeStore, Result, StoreError, Weight};
 
 /// Hexadecimal digits of a file's hash in its name: 128 bits.
 const HASH_DIGITS: usize = 32;
-/// Upper bound of what a cell's row takes besides its set and weights: 28 plain values of 8 bytes,
+/// Upper bound of what a cell's row takes besides its set and weights: 30 plain values of 8 bytes,
 /// and its share of page headers, offset index and footer.
 const CELL_BYTES_MAX: usize = 640;
 /// Upper bound of what a (cell, object) row takes: 7 plain values of 8 bytes or fewer, a
@@ -62,7 +62,8 @@ impl Default for Limits {
 /// What a manifest says besides what the rows show.
 #[derive(Clone, Debug, Default)]
 pub struct Description {
-    /// The scene. The numbers of triangles and objects are filled in from the objects.
+    /// The scene, with its numbers of particles and of particle systems. The numbers of triangles and
+    /// objects are filled in from the objects.
     pub scene: SceneSource,
     /// The configuration.
     pub config: Value,
@@ -78,6 +79,8 @@ pub struct DatasetWriter {
     limits: Limits,
     objects: Vec<SceneObject>,
     primitives: u64,
+    timeline: Timeline,
+    cell_count: u64,
     cells: Option<OpenFile>,
     pairs: Option<OpenFile>,
     /// Index rows; those at and behind `cells_from` and `pairs_from` wait for their files' names.
@@ -114,13 +117,13 @@ impl OpenFile {
 }
 
 impl DatasetWriter {
-    /// A writer into `store` for the scene with these objects.
+    /// A writer into `store` for the scene with these objects and states.
     ///
     /// # Errors
     /// [`StoreError::InvalidRows`] when objects are not numbered from 0 in the order of their
     /// primitives, without gaps.
-    pub fn new(store: &BakeStore, objects: Vec<SceneObject>) -> Result<Self> {
-        Self::with_limits(store, objects, Limits::default())
+    pub fn new(store: &BakeStore, objects: Vec<SceneObject>, timeline: Timeline) -> Result<Self> {
+        Self::with_limits(store, objects, timeline, Limits::default())
     }
 
     /// A writer with other limits, for tests.
@@ -130,6 +133,7 @@ impl DatasetWriter {
     pub fn with_limits(
         store: &BakeStore,
         objects: Vec<SceneObject>,
+        timeline: Timeline,
         limits: Limits,
     ) -> Result<Self> {
         let primitives = check_objects(&objects).map_err(|problem| SCENE.invalid(problem))?;
@@ -138,6 +142,8 @@ impl DatasetWriter {
             limits,
             objects,
             primitives,
+            timeline,
+            cell_count: 0,
             cells: None,
             pairs: None,
             index: Vec::new(),
@@ -149,39 +155,57 @@ impl DatasetWriter {
         })
     }
 
-    /// Adds a cell and its (cell, object) rows, one for each object of which it sees a primitive.
+    /// Adds a cell: the row of all states, then those of its runs of states where it has several; and
+    /// its (cell, object) rows, one for each object of which it sees a primitive in any state.
     ///
     /// # Errors
-    /// [`StoreError::InvalidRows`] when cells are not in strictly ascending order, or the objects'
-    /// rows do not fit the set; or what the store reports.
-    pub async fn push_cell(&mut self, row: &CellRow, pairs: &[ObjectRow]) -> Result<()> {
-        if self.index.last().is_some_and(|last| last.cell.id >= row.cell.id) {
-            return Err(CELLS.invalid(format!("cell {} is out of order", row.cell.id)));
+    /// [`StoreError::InvalidRows`] when cells are not in strictly ascending order, the rows of the
+    /// cell contradict each other, or the objects' rows do not fit the sets; or what the store
+    /// reports.
+    pub async fn push_cell(&mut self, rows: &[CellRow], pairs: &[ObjectRow]) -> Result<()> {
+        check_runs(rows, self.timeline.states()).map_err(|problem| CELLS.invalid(problem))?;
+        let union = &rows[0];
+        if self.index.last().is_some_and(|last| last.cell.id >= union.cell.id) {
+            return Err(CELLS.invalid(format!("cell {} is out of order", union.cell.id)));
         }
-        check_cell(row, self.primitives).map_err(|problem| CELLS.invalid(problem))?;
-        check_pairs(row, pairs, &self.objects).map_err(|problem| OBJECTS.invalid(problem))?;
-        check_weights(row, pairs, &self.objects).map_err(|problem| CELLS.invalid(problem))?;
-        let first_row = self.write_pairs(row.cell.id, pairs).await?;
-        self.write_cell(row).await?;
-        self.totals.primitives += row.set.len();
+        for row in rows {
+            check_cell(row, self.primitives).map_err(|problem| CELLS.invalid(problem))?;
+        }
+        check_pairs(union, pairs, &self.objects).map_err(|problem| OBJECTS.invalid(problem))?;
+        check_pair_states(rows, pairs, &self.objects)
+            .map_err(|problem| OBJECTS.invalid(problem))?;
+        check_weights(union, pairs, &self.objects).map_err(|problem| CELLS.invalid(problem))?;
+        let first_row = self.write_pairs(union.cell.id, pairs).await?;
+        self.cell_count += 1;
         self.totals.object_rows += pairs.len() as u64;
-        self.bounds = self.bounds.union(row.cell.bounds());
-        self.index.push(CellEntry {
-            cell: row.cell.clone(),
-            tile: row.tile,
-            primitives: count(&row.set),
-            set: SetLocation {
-                file: String::new(),
-                row_group: 0,
-                row: 0,
-                page_offset: 0,
-                page_bytes: 0,
-                page_row: 0,
-                weights_offset: 0,
-                weights_bytes: 0,
-            },
-            objects: ObjectsLocation { file: String::new(), first_row, rows: pairs.len() as u32 },
-        });
+        self.bounds = self.bounds.union(union.cell.bounds());
+        for row in rows {
+            self.write_cell(row).await?;
+            self.totals.cell_rows += 1;
+            self.totals.primitives += row.set.len();
+            self.index.push(CellEntry {
+                cell: row.cell.clone(),
+                tile: row.tile,
+                first_state: row.first_state,
+                last_state: row.last_state,
+                primitives: count(&row.set),
+                set: SetLocation {
+                    file: String::new(),
+                    row_group: 0,
+                    row: 0,
+                    page_offset: 0,
+                    page_bytes: 0,
+                    page_row: 0,
+                    weights_offset: 0,
+                    weights_bytes: 0,
+                },
+                objects: ObjectsLocation {
+                    file: String::new(),
+                    first_row,
+                    rows: pairs.len() as u32,
+                },
+            });
+        }
         Ok(())
     }
 
@@ -192,7 +216,11 @@ impl DatasetWriter {
     /// [`StoreError::InvalidRows`] when the numbering does not fit the objects; or what the store
     /// reports.
     pub async fn finish(mut self, numbering: &Numbering, about: Description) -> Result<Manifest> {
-        numbering.check(self.primitives).map_err(|problem| INSTANCES.invalid(problem))?;
+        let particles = about.scene.particles;
+        let triangles = self.primitives.checked_sub(particles).ok_or_else(|| {
+            SCENE.invalid(format!("{particles} particles are more than there are primitives"))
+        })?;
+        numbering.check(triangles).map_err(|problem| INSTANCES.invalid(problem))?;
         self.close_cells().await?;
         self.close_pairs().await?;
         self.store_index().await?;
@@ -203,14 +231,12 @@ impl DatasetWriter {
         Ok(Manifest {
             format: FORMAT.into(),
             version: VERSION,
-            scene: SceneSource {
-                triangles: self.primitives,
-                objects: self.objects.len() as u64,
-                ..about.scene
-            },
+            scene: SceneSource { triangles, objects: self.objects.len() as u64, ..about.scene },
             config: sorted(&about.config),
             config_hash: about.config_hash,
-            cells: self.index.len() as u64,
+            states: self.timeline.states(),
+            key_times: self.timeline.key_times().to_vec(),
+            cells: self.cell_count,
             skipped: about.skipped,
             totals: self.totals,
             bounds: (!self.bounds.is_empty()).then(|| self.bounds.into()),
@@ -473,6 +499,76 @@ pub(crate) fn check_objects(objects: &[SceneObject]) -> Result<u64, String> {
     Ok(next.into())
 }
 
+/// Checks the rows of one cell against each other: that of all states first, then, where there are
+/// several runs, one a run of states with equal sets.
+pub(crate) fn check_runs(rows: &[CellRow], states: u32) -> Result<(), String> {
+    let Some((union, runs)) = rows.split_first() else {
+        return Err("a cell has no row".into());
+    };
+    let id = union.cell.id;
+    if rows.iter().any(|row| row.last_state < row.first_state || row.last_state >= states) {
+        return Err(format!("a row of cell {id} is of states that the scene does not have"));
+    }
+    if union.states() != (0..states) {
+        return Err(format!("the first row of cell {id} is not of all {states} states"));
+    }
+    if rows.iter().any(|row| row.cell != union.cell || row.tile != union.tile) {
+        return Err(format!("the rows of cell {id} are of different cells"));
+    }
+    if !rows.is_sorted_by(|a, b| a.order() < b.order()) {
+        return Err(format!("the rows of cell {id} are not in strictly ascending order"));
+    }
+    if runs.is_empty() {
+        return Ok(());
+    }
+    let runs = by_time(runs);
+    let meet = runs.windows(2).all(|pair| pair[0].states().end == pair[1].first_state);
+    let whole = runs[0].first_state..runs[runs.len() - 1].last_state + 1;
+    if !meet || whole != (0..states) {
+        return Err(format!("the runs of cell {id} do not take each state once"));
+    }
+    if runs.windows(2).any(|pair| pair[0].set == pair[1].set) {
+        return Err(format!("two runs of cell {id} that meet have equal sets"));
+    }
+    if PrimitiveSet::union(runs.iter().map(|run| &run.set)) != union.set {
+        return Err(format!("the first row of cell {id} is not the union of its runs"));
+    }
+    Ok(())
+}
+
+/// Rows of runs in the order of their states.
+fn by_time(runs: &[CellRow]) -> Vec<&CellRow> {
+    let mut runs: Vec<&CellRow> = runs.iter().collect();
+    runs.sort_unstable_by_key(|run| run.first_state);
+    runs
+}
+
+/// Checks the states of a cell's (cell, object) rows: the first and the last in which the object is
+/// visible.
+///
+/// The rows have passed [`check_runs`] and [`check_pairs`].
+pub(crate) fn check_pair_states(
+    rows: &[CellRow],
+    pairs: &[ObjectRow],
+    objects: &[SceneObject],
+) -> Result<(), String> {
+    let runs = by_time(if rows.len() > 1 { &rows[1..] } else { rows });
+    for pair in pairs {
+        let object = &objects[pair.object.index()];
+        let own = object.first_primitive..object.end_primitive;
+        let seen = |run: &&&CellRow| run.set.count_in(own.clone()) > 0;
+        let first = runs.iter().find(seen).map(|run| run.first_state);
+        let last = runs.iter().rev().find(seen).map(|run| run.last_state);
+        if (Some(pair.first_state), Some(pair.last_state)) != (first, last) {
+            return Err(format!(
+                "cell {} does not see object {} in the states {} to {} that its row says",
+                pair.cell, pair.object, pair.first_state, pair.last_state
+            ));
+        }
+    }
+    Ok(())
+}
+
 /// Checks a cell's row against the scene.
 pub(crate) fn check_cell(row: &CellRow, primitives: u64) -> Result<(), String> {
     let id = row.cell.id;
@@ -503,7 +599,7 @@ const SUM_ROUNDING: f64 = 1.0 / (1 << 20) as f64;
 /// What helps against weights that contradict themselves.
 const REPAIR: &str = "fetch the dataset again from where it was published, or bake again";
 
-/// Checks a cell's weights against the weights of its objects: each object's is the sum of those
+/// Checks the weights of a cell's first row against the weights of its objects: each object's is the sum of those
 /// of its primitives, up to the rounding of the codes.
 ///
 /// The rows have passed [`check_cell`] and [`check_pairs`].

@@ -10,8 +10,8 @@ use glam::DVec3;
 use object_store::memory::InMemory;
 use sightline_geometry::{CellId, PrimitiveId, PrimitiveSet};
 use sightline_store::{
-    BakeStore, CellRow, Dataset, DatasetWriter, ErrorClass, FileKind, Limits, Published,
-    StoreError, Weight, keys, publish,
+    BakeStore, CellEntry, CellRow, Dataset, DatasetWriter, ErrorClass, FileKind, Limits, ObjectRow,
+    Published, StoreError, Weight, keys, publish,
 };
 use support::Sample;
 use support::faulty::{Fault, Faulty};
@@ -37,7 +37,7 @@ async fn a_dataset_comes_back_as_it_was_written() {
         assert_eq!(&dataset.object_rows(row.cell.id).await.unwrap(), pairs);
     }
     let rows: Vec<_> = dataset.cell_rows().try_collect().await.unwrap();
-    assert!(rows.iter().eq(sample.cells.iter().map(|(row, _)| row)));
+    assert_eq!(rows, sample.all_rows());
     let pairs: Vec<_> = dataset.all_object_rows().try_collect().await.unwrap();
     assert!(pairs.iter().eq(sample.cells.iter().flat_map(|(_, pairs)| pairs)));
     assert_eq!(dataset.objects().await.unwrap(), sample.objects);
@@ -93,7 +93,14 @@ async fn pages_in_the_index_hold_the_cells_set_and_weights() {
     let store = published(&sample).await;
     let dataset = Dataset::open(&store).await.unwrap();
     let (mut ends, mut weight_pages) = (Vec::new(), Vec::new());
-    for entry in dataset.cells() {
+    let of_cell = |cell: &CellEntry| {
+        let runs = dataset.runs(cell.cell.id);
+        let behind = if runs.len() > 1 { runs } else { &[] };
+        let mut entries = [std::slice::from_ref(cell), behind].concat();
+        entries.sort_by_key(|entry| (entry.set.row_group, entry.set.row));
+        entries
+    };
+    for entry in &dataset.cells().iter().flat_map(of_cell).collect::<Vec<_>>() {
         assert_eq!(entry.set.page_row, 0, "a page holds one set");
         let range = u64::from(entry.set.page_offset)
             ..u64::from(entry.set.page_offset + entry.set.page_bytes);
@@ -285,28 +292,32 @@ async fn later_versions_are_refused_as_such() {
     let store = published(&Sample::golden()).await;
     let pointer = store.get(keys::POINTER).await.unwrap();
     let text = String::from_utf8(pointer.to_vec()).unwrap();
-    let later = text.replace("\"version\":2", "\"version\":3,\"more\":true");
+    let later = text.replace("\"version\":3", "\"version\":4,\"more\":true");
     store.put_pointer(keys::POINTER, later).await.unwrap();
     let error = Dataset::open(&store).await.unwrap_err();
-    assert!(matches!(error, StoreError::UnsupportedVersion { found: 3, .. }), "{error}");
+    assert!(matches!(error, StoreError::UnsupportedVersion { found: 4, .. }), "{error}");
 }
 
 #[tokio::test]
 async fn rows_that_break_the_contract_are_refused() {
     let sample = Sample::golden();
     let store = BakeStore::in_memory();
-    let new = || DatasetWriter::new(&store, sample.objects.clone()).unwrap();
-    let (cell, pairs) = &sample.cells[1];
+    let clock = || sample.timeline.clone();
+    let new = || DatasetWriter::new(&store, sample.objects.clone(), clock()).unwrap();
+    let (cell, pairs) = (sample.rows(1), &sample.cells[1].1);
 
     let mut writer = new();
-    writer.push_cell(cell, pairs).await.unwrap();
-    let error = writer.push_cell(cell, pairs).await.unwrap_err();
+    writer.push_cell(&cell, pairs).await.unwrap();
+    let error = writer.push_cell(&cell, pairs).await.unwrap_err();
     assert!(error.to_string().contains("out of order"), "{error}");
-    let error = new().push_cell(cell, &pairs[1..]).await.unwrap_err();
+    let error = new().push_cell(&cell, &pairs[1..]).await.unwrap_err();
     assert!(error.to_string().contains("the rows of its objects have"), "{error}");
     let mut gap = sample.objects.clone();
     gap.remove(3);
-    assert_eq!(DatasetWriter::new(&store, gap).err().unwrap().class(), ErrorClass::FixInput);
+    assert_eq!(
+        DatasetWriter::new(&store, gap, clock()).err().unwrap().class(),
+        ErrorClass::FixInput
+    );
     let mut numbering = sample.numbering.clone();
     numbering.instances.pop();
     let error = new().finish(&numbering, sample.description.clone()).await.unwrap_err();
@@ -331,8 +342,9 @@ async fn weights_that_contradict_their_objects_are_refused_with_cell_and_remedy(
     let store = BakeStore::in_memory();
     let (cell, pairs) = &sample.cells[1];
     let refused = async |cell: CellRow| {
-        let mut writer = DatasetWriter::new(&store, sample.objects.clone()).unwrap();
-        let error = writer.push_cell(&cell, pairs).await.unwrap_err().to_string();
+        let (objects, timeline) = (sample.objects.clone(), sample.timeline.clone());
+        let mut writer = DatasetWriter::new(&store, objects, timeline).unwrap();
+        let error = writer.push_cell(&[cell], pairs).await.unwrap_err().to_string();
         assert!(error.contains("cell 1") && error.contains("bake again"), "{error}");
         error
     };
@@ -358,4 +370,65 @@ async fn a_dataset_without_cells_is_a_dataset() {
     assert!(Dataset::check(&store).await.unwrap().is_sound());
     let nothing = published(&Sample::new(0, 0)).await;
     assert!(Dataset::check(&nothing).await.unwrap().is_sound());
+}
+
+#[tokio::test]
+async fn a_state_has_the_row_of_its_run_and_no_state_that_of_all() {
+    let sample = Sample::golden();
+    let store = published(&sample).await;
+    let dataset = Dataset::open(&store).await.unwrap();
+    assert_eq!((dataset.states(), dataset.timeline()), (5, &sample.timeline));
+    assert_eq!(dataset.cells().len(), 24, "one entry a cell");
+    assert_eq!(dataset.manifest().totals.cell_rows, 24 + 8 * 3);
+    for (k, (union, _)) in sample.cells.iter().enumerate() {
+        let id = union.cell.id;
+        let runs = if sample.runs[k].is_empty() {
+            std::slice::from_ref(union)
+        } else {
+            &sample.runs[k][..]
+        };
+        assert!(dataset.runs(id).iter().map(|r| r.states()).eq(runs.iter().map(CellRow::states)));
+        let sets = dataset.state_sets(id).await.unwrap();
+        assert_eq!((sets.union(), sets.runs().len()), (union.set.clone(), runs.len()));
+        for state in 0..5 {
+            let run = runs.iter().find(|run| run.states().contains(&state)).unwrap();
+            assert_eq!(&dataset.cell_in_state(id, state).await.unwrap(), run);
+            assert_eq!(sets.at(state), &run.set);
+        }
+        let error = dataset.cell_in_state(id, 5).await.unwrap_err();
+        assert_eq!(error.class(), ErrorClass::NotFound);
+    }
+    assert!(dataset.runs(CellId(999)).is_empty());
+}
+
+/// Damages the rows of a cell and of its objects.
+type Change<'a> = &'a dyn Fn(&mut Vec<CellRow>, &mut Vec<ObjectRow>);
+
+#[tokio::test]
+async fn rows_of_states_that_contradict_each_other_are_refused() {
+    let sample = Sample::golden();
+    let store = BakeStore::in_memory();
+    let (rows, pairs) = (sample.rows(3), sample.cells[3].1.clone());
+    let refused = async |change: Change<'_>| {
+        let (mut rows, mut pairs) = (rows.clone(), pairs.clone());
+        change(&mut rows, &mut pairs);
+        let (objects, timeline) = (sample.objects.clone(), sample.timeline.clone());
+        let mut writer = DatasetWriter::new(&store, objects, timeline).unwrap();
+        writer.push_cell(&rows, &pairs).await.unwrap_err().to_string()
+    };
+    let cases: [(Change<'_>, &str); 9] = [
+        (&|rows, _| rows.clear(), "has no row"),
+        (&|rows, _| drop(rows.remove(0)), "is not of all 5 states"),
+        (&|rows, _| rows.swap(1, 2), "ascending order"),
+        (&|rows, _| rows[2].last_state = 9, "states that the scene does not have"),
+        (&|rows, _| drop(rows.pop()), "do not take each state once"),
+        (&|rows, _| rows[1].cell.id = CellId(4), "of different cells"),
+        (&|rows, _| rows[3].set = rows[1].set.clone(), "have equal sets"),
+        (&|rows, _| rows[0].set = rows[1].set.clone(), "is not the union of its runs"),
+        (&|_, pairs| pairs[0].last_state = 3, "that its row says"),
+    ];
+    for (change, says) in cases {
+        let error = refused(change).await;
+        assert!(error.contains(says), "{error}");
+    }
 }

@@ -27,7 +27,7 @@ async fn datasets_of_version_1_still_read() {
     assert!(report.is_sound(), "{:?}", report.problems);
     let dataset = Dataset::open(&store).await.unwrap();
     assert_eq!(dataset.manifest().version, 1);
-    for (row, pairs) in &Sample::golden().cells {
+    for (row, pairs) in &Sample::golden_at_rest().cells {
         let old = dataset.cell(row.cell.id).await.unwrap();
         assert_eq!((&old.cell, old.tile, &old.set), (&row.cell, row.tile, &row.set));
         assert!(old.weights.iter().all(|w| *w == Weight::UNMEASURED));
@@ -42,14 +42,35 @@ async fn datasets_of_version_1_still_read() {
 }
 
 #[tokio::test]
-async fn golden_dataset_still_reads() {
+async fn datasets_of_version_2_still_read() {
     let store = golden("dataset-v2");
     let report = Dataset::check(&store).await.unwrap();
     assert!(report.is_sound(), "{:?}", report.problems);
     let dataset = Dataset::open(&store).await.unwrap();
-    let sample = Sample::golden();
+    assert_eq!((dataset.manifest().version, dataset.states()), (2, 1));
+    let sample = Sample::golden_at_rest();
     let rows: Vec<_> = dataset.cell_rows().try_collect().await.unwrap();
-    assert!(rows.iter().eq(sample.cells.iter().map(|(row, _)| row)));
+    assert_eq!(rows, sample.all_rows());
+    for (row, pairs) in &sample.cells {
+        let id = row.cell.id;
+        assert_eq!(&dataset.object_rows(id).await.unwrap(), pairs);
+        assert_eq!(&dataset.cell_in_state(id, 0).await.unwrap(), row);
+        assert_eq!(dataset.runs(id), [dataset.entry(id).unwrap().clone()]);
+    }
+    assert_eq!(dataset.objects().await.unwrap(), sample.objects);
+    assert_eq!(dataset.numbering().await.unwrap(), sample.numbering);
+}
+
+#[tokio::test]
+async fn golden_dataset_still_reads() {
+    let store = golden("dataset-v3");
+    let report = Dataset::check(&store).await.unwrap();
+    assert!(report.is_sound(), "{:?}", report.problems);
+    let dataset = Dataset::open(&store).await.unwrap();
+    let sample = Sample::golden();
+    assert_eq!(dataset.timeline(), &sample.timeline);
+    let rows: Vec<_> = dataset.cell_rows().try_collect().await.unwrap();
+    assert_eq!(rows, sample.all_rows());
     for (row, pairs) in &sample.cells {
         assert_eq!(&dataset.object_rows(row.cell.id).await.unwrap(), pairs);
     }
@@ -62,7 +83,7 @@ async fn writer_reproduces_golden_bytes() {
     let store = BakeStore::in_memory();
     let manifest = Sample::golden().write(&store, Limits::default()).await;
     publish(&store, &manifest).await.unwrap();
-    let golden = golden("dataset-v2");
+    let golden = golden("dataset-v3");
     let keys = golden.list("").await.unwrap();
     assert_eq!(store.list("").await.unwrap(), keys);
     for key in keys {
@@ -72,9 +93,10 @@ async fn writer_reproduces_golden_bytes() {
 
 #[tokio::test]
 async fn golden_parts_still_read_and_are_reproduced() {
-    let store = golden("parts-v2");
-    let (cells, pairs): (Vec<_>, Vec<_>) = Sample::golden().cells.into_iter().unzip();
-    let pairs = pairs.concat();
+    let store = golden("parts-v3");
+    let sample = Sample::golden();
+    let cells = sample.all_rows();
+    let pairs: Vec<_> = sample.cells.into_iter().flat_map(|(_, pairs)| pairs).collect();
 
     let bytes = store.get("segments.parquet").await.unwrap();
     assert_eq!(decode_segment_part("segments", bytes.clone()).unwrap(), segments(16));

@@ -12,8 +12,8 @@ use sightline_store::{
 use support::{Sample, segments};
 
 fn cells_and_pairs() -> (Vec<CellRow>, Vec<ObjectRow>) {
-    let (cells, pairs): (Vec<_>, Vec<_>) = Sample::golden().cells.into_iter().unzip();
-    (cells, pairs.concat())
+    let sample = Sample::golden();
+    (sample.all_rows(), sample.cells.into_iter().flat_map(|(_, pairs)| pairs).collect())
 }
 
 #[test]
@@ -23,7 +23,9 @@ fn parts_come_back_as_they_were_written() {
     assert_eq!(bytes, encode_segment_part(&rows).unwrap());
     assert_eq!(decode_segment_part("f", bytes.clone()).unwrap(), rows);
     let some = decode_segment_part_where("f", bytes, |s| s == SegmentId(9)).unwrap();
-    assert_eq!(some, &rows[3..4]);
+    // The first segment has two rows.
+    assert_eq!(some, &rows[4..5]);
+    assert_eq!(some[0].states(), 0..5);
 
     let (cells, pairs) = cells_and_pairs();
     let bytes = encode_cell_part(&cells).unwrap();
@@ -47,9 +49,17 @@ fn rows_that_break_the_contract_are_refused() {
     rows.swap(0, 1);
     assert_eq!(encode_segment_part(&rows).unwrap_err().class(), ErrorClass::FixInput);
     let mut rows = segments(3);
-    rows[2].weights.push(0.5);
+    rows[3].weights.push(0.5);
     let error = encode_segment_part(&rows).unwrap_err();
     assert!(error.to_string().contains("segment 6"), "{error}");
+    let mut rows = segments(3);
+    rows[1].last_state = 1;
+    let error = encode_segment_part(&rows).unwrap_err();
+    assert!(error.to_string().contains("states 2 to 1"), "{error}");
+    let mut cells = cells_and_pairs().0;
+    cells.swap(0, 1);
+    let error = encode_cell_part(&cells).unwrap_err();
+    assert!(error.to_string().contains("ascending"), "the row of all states is first: {error}");
 }
 
 #[test]

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use sightline_coordinator::{
     Coordinator, CoordinatorHandle, CoordinatorOptions, Prepared, Summary as Ended, prepare,
 };
-use sightline_jobs::{BakeConfig, BakeStatus, Phase, Plan};
+use sightline_jobs::{BakeConfig, BakeStatus, Done, Phase, Plan};
 use sightline_scene::SceneDigest;
 use sightline_store::{BakeStore, Dataset};
 use sightline_worker::{Worker, WorkerOptions};
@@ -169,12 +169,14 @@ pub async fn watch(coordinator: &mut CoordinatorHandle, mut phases: Option<&mut 
         let (done, all) = (first.tasks_resumed, first.tasks.tasks);
         note(&format!("{done} of {} were done before", count(u64::from(all), "task")));
     }
-    let mut progress = Progress::new("bake", "units", first.cells.total + first.segments.total);
+    let parts = |status: &BakeStatus| [status.cells, status.segments, status.joins];
+    let all = parts(&first).iter().map(|part| part.total).sum();
+    let mut progress = Progress::new("bake", "units", all);
     let mut merging = false;
     let mut signal = std::pin::pin!(stop_signal());
     loop {
         let now = status.borrow_and_update().clone();
-        progress.set(now.cells.done + now.segments.done, &standing(&now));
+        progress.set(parts(&now).iter().map(|part| part.done).sum(), &standing(&now));
         if now.phase == Phase::Merging && !merging {
             merging = true;
             if let Some(phases) = &mut phases {
@@ -201,8 +203,12 @@ pub async fn watch(coordinator: &mut CoordinatorHandle, mut phases: Option<&mut 
 }
 
 fn standing(status: &BakeStatus) -> String {
-    let cells =
-        format!("{} of {} cells done", thousands(status.cells.done), thousands(status.cells.total));
+    let done = |part: Done| format!("{} of {}", thousands(part.done), thousands(part.total));
+    let cells = match status.joins.total {
+        0 => format!("{} cells done", done(status.cells)),
+        // Each cell counts once a range of states.
+        _ => format!("{} cells solved, {} joined", done(status.cells), done(status.joins)),
+    };
     match status.phase {
         Phase::Merging => format!("{cells}, merging"),
         _ => cells,
@@ -249,6 +255,7 @@ impl Baked {
             "cells": self.plan.cells.len(),
             "skipped": self.plan.skipped,
             "segments": self.plan.segments.len(),
+            "states": self.plan.states(),
             "tasks": self.plan.tasks.len(),
             "tasks_resumed": status.tasks_resumed,
             "solve_ms": status.solve_ms,
@@ -302,6 +309,7 @@ fn dry_run(command: &Bake) -> Result<()> {
             "skipped": plan.skipped,
             "segments": plan.segments.len(),
             "segment_metres": length,
+            "states": plan.states(),
             "tasks": plan.tasks.len(),
             "time": phases.to_json(),
         }));
@@ -319,6 +327,7 @@ fn dry_run(command: &Bake) -> Result<()> {
             "segments",
             format!("{}, {length:.0} m together", thousands(plan.segments.len() as u64)),
         )
+        .row("states", thousands(u64::from(plan.states())))
         .row("tasks", thousands(plan.tasks.len() as u64));
     phases.add_to(&mut table);
     print(&format!("{table}\nConfiguration:\n{}", plan.config.to_toml()));

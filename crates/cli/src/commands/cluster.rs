@@ -32,7 +32,7 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
     let mut table = Table::default();
     table
         .row("dataset", format!("{}, manifest {}{changed}", command.input.out, ended.manifest))
-        .row("cells", thousands(status.cells.total))
+        .row("cells", thousands(status.dataset_cells()))
         .row("segments", thousands(status.segments.total))
         .row("resumed", count(u64::from(status.tasks_resumed), "task"))
         .row("workers", thousands(status.workers.len() as u64))

@@ -26,18 +26,29 @@ pub async fn open(location: &str) -> Result<Dataset> {
 pub async fn open_with_scene(input: &DatasetInput) -> Result<(Dataset, Scene, PathBuf)> {
     let dataset = open(&input.dataset).await?;
     let path = find_scene(&dataset, input).await?;
-    let scene = Scene::open(&path, &open_options(dataset.manifest()))?;
+    let scene = Scene::open(&path, &open_options(dataset.manifest(), &path))?;
     expect_digest(dataset.manifest(), &scene.digest, &path)?;
     Ok((dataset, scene, path))
 }
 
-/// How the bake read the scene: see-through patterns decide what hides what.
-fn open_options(manifest: &Manifest) -> OpenOptions {
-    let patterns = manifest.config["scene"]["see_through"].as_array();
-    let mut options = OpenOptions::default();
-    options.see_through =
-        patterns.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect();
-    options
+/// How the bake read the scene: see-through patterns decide what hides what, and particles are in tables
+/// relative to it.
+fn open_options(manifest: &Manifest, path: &Path) -> OpenOptions {
+    let scene = &manifest.config["scene"];
+    let texts = |key: &str| -> Vec<String> {
+        let texts = scene[key].as_array();
+        texts.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect()
+    };
+    // Datasets from before there was motion were baked at rest.
+    let motion_error = scene["motion_error"].as_f64();
+    let animation = if motion_error.is_some() { scene["animation"].as_str() } else { Some("none") };
+    OpenOptions::of_bake(
+        path,
+        &texts("see_through"),
+        &texts("particles"),
+        animation,
+        motion_error.unwrap_or_else(|| OpenOptions::default().motion_error),
+    )
 }
 
 async fn find_scene(dataset: &Dataset, input: &DatasetInput) -> Result<PathBuf> {
@@ -55,8 +66,9 @@ async fn find_scene(dataset: &Dataset, input: &DatasetInput) -> Result<PathBuf> 
     candidates.push(folder.join("..").join(&source.uri));
     candidates.push(folder.join(&source.uri));
     for path in &candidates {
-        if path.is_file() && sightline_scene::digest(path).is_ok_and(|d| d.combined == source.hash)
-        {
+        let tables = open_options(dataset.manifest(), path).particles;
+        let digest = || sightline_scene::digest_with(path, &tables);
+        if path.is_file() && digest().is_ok_and(|d| d.combined == source.hash) {
             return Ok(path.clone());
         }
     }
@@ -130,6 +142,8 @@ pub struct Summary {
     pub cells: u64,
     /// Primitives of the scene.
     pub primitives: u64,
+    /// Of these, particles.
+    pub particles: u64,
     /// Mean number of visible primitives a cell.
     pub visible_mean: f64,
     /// Largest number of visible primitives of a cell.
@@ -153,12 +167,17 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Reads all cells.
+    /// Reads all cells; of each, the row of all states.
     pub async fn of(dataset: &Dataset) -> Result<Self> {
-        let mut out = Self { primitives: dataset.manifest().scene.triangles, ..Self::default() };
+        let scene = &dataset.manifest().scene;
+        let (primitives, particles) = (scene.primitives(), scene.particles);
+        let mut out = Self { primitives, particles, ..Self::default() };
         let (mut visible, mut error) = (0u64, 0.0f64);
         let mut rows = std::pin::pin!(dataset.cell_rows());
         while let Some(row) = rows.try_next().await? {
+            if row.states() != (0..dataset.states()) {
+                continue;
+            }
             let members = row.set.len();
             out.cells += 1;
             visible += members;
@@ -205,7 +224,11 @@ impl Summary {
     /// Adds the figures to a table.
     pub fn add_to(&self, table: &mut crate::report::Table) {
         use crate::report::{count, percent, thousands};
-        table.row("cells", thousands(self.cells)).row("triangles", thousands(self.primitives));
+        let triangles = self.primitives - self.particles;
+        table.row("cells", thousands(self.cells)).row("triangles", thousands(triangles));
+        if self.particles > 0 {
+            table.row("particles", thousands(self.particles));
+        }
         if self.cells == 0 {
             return;
         }
@@ -218,7 +241,8 @@ impl Summary {
             ),
         );
         if let Some(factor) = self.reduction() {
-            table.row("reduction", format!("{factor:.1} times fewer triangles"));
+            let kind = if self.particles > 0 { "primitives" } else { "triangles" };
+            table.row("reduction", format!("{factor:.1} times fewer {kind}"));
         }
         if self.heldout_rays > 0 {
             table.row(

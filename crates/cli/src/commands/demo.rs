@@ -90,6 +90,7 @@ fn verification(input: DatasetInput, threads: Option<u32>) -> Verify {
         cells: CellChoice::All,
         cell: None,
         viewpoint: None,
+        moment: None,
         seed: 1,
         max_mean: None,
         max_worst: None,

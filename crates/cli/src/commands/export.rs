@@ -28,6 +28,7 @@ pub fn run(command: &Export) -> Result<()> {
             "cell": command.cell,
             "out": command.out,
             "triangles": report.triangles,
+            "particles": report.particles,
             "unique_triangles": report.unique_triangles,
             "nodes": report.nodes,
             "meshes": report.meshes,

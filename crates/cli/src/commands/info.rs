@@ -60,6 +60,7 @@ fn describe_scene(path: &Path, command: &Info) -> Result<()> {
         .row("digest", &scene.digest.combined[..16])
         .row("bounds", box_text(scene.geometry.bounds))
         .row("triangles", thousands(report.instanced_triangles))
+        .row("particles", thousands(report.particles))
         .row("unique triangles", thousands(report.unique_triangles))
         .row("unique vertices", thousands(report.unique_vertices))
         .row("objects", thousands(report.objects))
@@ -180,7 +181,8 @@ async fn describe_dataset(dataset: &Dataset, command: &Info) -> Result<()> {
                 manifest.scene.hash.chars().take(16).collect::<String>()
             ),
         )
-        .row("objects", thousands(manifest.scene.objects));
+        .row("objects", thousands(manifest.scene.objects))
+        .row("states", thousands(u64::from(manifest.states)));
     summary.add_to(&mut table);
     if let Some(b) = manifest.bounds {
         table.row("view region", box_text(Bounds { min: b.min.into(), max: b.max.into() }));
@@ -190,7 +192,11 @@ async fn describe_dataset(dataset: &Dataset, command: &Info) -> Result<()> {
     }
     let totals = &manifest.totals;
     let bits = 8.0 * totals.set_bytes as f64 / totals.primitives.max(1) as f64;
-    let weights: u64 = dataset.cells().iter().map(|e| u64::from(e.set.weights_bytes)).sum();
+    let rows = dataset.cells().iter().flat_map(|cell| {
+        let runs = dataset.runs(cell.cell.id);
+        std::iter::once(cell).chain(if runs.len() > 1 { runs } else { &[] })
+    });
+    let weights: u64 = rows.map(|row| u64::from(row.set.weights_bytes)).sum();
     let weight_bits = 8.0 * weights as f64 / totals.primitives.max(1) as f64;
     table
         .row("sets", format!("{} ({bits:.2} bits a member)", bytes(totals.set_bytes)))
@@ -235,6 +241,19 @@ fn needed(row: &CellRow) -> String {
     format!("{} of what is seen", texts.join(", "))
 }
 
+/// The runs of states of a cell, for people.
+fn states_text(dataset: &Dataset, cell: CellId) -> String {
+    let runs = dataset.runs(cell);
+    let sizes = || runs.iter().map(|run| u64::from(run.primitives));
+    let states = count(u64::from(dataset.states()), "state");
+    if runs.len() < 2 {
+        return format!("{states}, the same in all");
+    }
+    let (least, most) = (sizes().min().unwrap_or(0), sizes().max().unwrap_or(0));
+    let (least, most) = (thousands(least), thousands(most));
+    format!("{states} in {} of {least} to {most} visible", count(runs.len() as u64, "run"))
+}
+
 async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Result<()> {
     super::expect_cell(dataset, cell)?;
     let row = dataset.cell(cell).await?;
@@ -251,6 +270,17 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
                     "object": p.object, "path": name(p.object), "weight": p.weight,
                     "visible_primitives": p.visible_primitives,
                     "total_primitives": p.total_primitives,
+                    "first_state": p.first_state, "last_state": p.last_state,
+                })
+            })
+            .collect();
+        let states: Vec<Value> = dataset
+            .runs(cell)
+            .iter()
+            .map(|run| {
+                json!({
+                    "first_state": run.first_state, "last_state": run.last_state,
+                    "visible_primitives": run.primitives,
                 })
             })
             .collect();
@@ -262,6 +292,7 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
             "corners": row.cell.corners,
             "height": row.cell.height,
             "visible_primitives": row.set.len(),
+            "states": states,
             "runs": row.set.runs().len(),
             "segments": effort.segments,
             "runs": effort.runs,
@@ -280,6 +311,7 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
         }));
         return Ok(());
     }
+    let kind = if dataset.manifest().scene.particles > 0 { "primitive" } else { "triangle" };
     let mut table = Table::default();
     table
         .row("cell", format!("{cell}, tile {}, {}", row.tile[0], row.tile[1]))
@@ -288,11 +320,12 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
             "visible",
             format!(
                 "{} of {} in {}",
-                count(row.set.len(), "triangle"),
-                thousands(dataset.manifest().scene.triangles),
+                count(row.set.len(), kind),
+                thousands(dataset.manifest().scene.primitives()),
                 count(row.set.runs().len() as u64, "run")
             ),
         )
+        .row("states", states_text(dataset, cell))
         .row("objects", thousands(pairs.len() as u64))
         .row("needed", needed(&row))
         .row(
@@ -326,7 +359,7 @@ async fn describe_cell(dataset: &Dataset, cell: CellId, command: &Info) -> Resul
                 "{:>8.4} %  {} of {}",
                 100.0 * pair.weight,
                 thousands(u64::from(pair.visible_primitives)),
-                count(u64::from(pair.total_primitives), "triangle")
+                count(u64::from(pair.total_primitives), kind)
             ),
         );
     }

@@ -2,13 +2,16 @@
 //!
 //! Everything printed can be repeated: viewpoints and directions follow from the seed, the cell
 //! and the viewpoint's number, and the worst viewpoint comes with a command that measures it
-//! alone, to the same count of wrong rays.
+//! alone, to the same count of wrong rays. Where the scene moves, each viewpoint is looked at at a random
+//! moment, and what counts is the set of the moment's state.
 
 use std::time::Instant;
 
 use serde_json::{Value, json};
-use sightline_geometry::{CellId, PrimitiveSet, ViewCell};
-use sightline_quality::{CellError, ViewpointError, measure_cell, measure_viewpoint};
+use sightline_geometry::{CellId, Moment, StateSets, Timeline, ViewCell};
+use sightline_quality::{
+    CellError, Suspect, ViewpointError, measure_cell_over, measure_viewpoint_at,
+};
 use sightline_scene::Scene;
 use sightline_store::{CellRow, Dataset};
 
@@ -115,7 +118,8 @@ pub fn measure(
         progress.set(done, &format!("mean error {}", percent(findings.mean())));
         let row = runtime.block_on(dataset.cell(cell))?;
         expect_members(&row, scene)?;
-        findings.add(&measure_row(scene, &row.cell, &row.set, command));
+        let sets = runtime.block_on(dataset.state_sets(cell))?;
+        findings.add(&measure_row(scene, &row.cell, &sets, dataset.timeline(), command)?);
         findings.baked_sum += row.effort.heldout_error_mean;
         findings.baked_met += u64::from(row.effort.target_met);
     }
@@ -124,15 +128,37 @@ pub fn measure(
     Ok(findings)
 }
 
-fn measure_row(scene: &Scene, cell: &ViewCell, set: &PrimitiveSet, command: &Verify) -> CellError {
+fn measure_row(
+    scene: &Scene,
+    cell: &ViewCell,
+    sets: &StateSets,
+    timeline: &Timeline,
+    command: &Verify,
+) -> Result<CellError> {
     let Verify { viewpoints, rays, seed, .. } = *command;
-    match command.viewpoint {
-        Some(viewpoint) => {
-            let error = measure_viewpoint(&scene.geometry, set, viewpoint, rays, seed);
-            CellError { cell: cell.id, viewpoints: vec![error] }
-        }
-        None => measure_cell(&scene.geometry, set, cell, viewpoints, rays, seed),
+    let Some(viewpoint) = command.viewpoint else {
+        return Ok(measure_cell_over(
+            &scene.geometry,
+            sets,
+            timeline,
+            cell,
+            viewpoints,
+            rays,
+            seed,
+        ));
+    };
+    let moment = command.moment.unwrap_or(Moment::START);
+    if !sets.states().contains(&moment.state) {
+        let states = count(u64::from(sets.states().end), "state");
+        return Err(Failure::new(
+            Kind::Usage,
+            format!("there is no state {}: the dataset has {states}", moment.state),
+        )
+        .with_help("give --moment=STATE,T with a state from 0 and T from 0 to 1"));
     }
+    let at = Suspect { viewpoint, moment };
+    let error = measure_viewpoint_at(&scene.geometry, sets, at, rays, seed);
+    Ok(CellError { cell: cell.id, viewpoints: vec![error] })
 }
 
 fn choose(dataset: &Dataset, command: &Verify) -> Result<Vec<CellId>> {
@@ -190,6 +216,10 @@ fn reproduce(worst: &Worst, command: &Verify) -> String {
         " --cell {} --viewpoint={},{},{} --rays {} --seed {}",
         worst.cell, at.x, at.y, at.z, worst.error.rays, worst.error.seed
     ));
+    let moment = worst.error.moment;
+    if moment != Moment::START {
+        text.push_str(&format!(" --moment={},{}", moment.state, moment.t));
+    }
     text
 }
 
@@ -203,6 +233,7 @@ fn to_json(findings: &Findings, command: &Verify, exceeded: &[String]) -> Value 
         json!({
             "cell": w.cell,
             "viewpoint": w.error.viewpoint,
+            "moment": w.error.moment,
             "rays": w.error.rays,
             "wrong": w.error.wrong,
             "error": w.error.error,

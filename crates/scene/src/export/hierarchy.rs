@@ -1,7 +1,7 @@
 //! The nodes of the output: those with something visible, cameras or lights, and their parents.
 //!
 //! Nodes keep their order, names, transforms and extras. Nodes that the export adds (children for
-//! instances, roots for skinned meshes) come behind them.
+//! instances, roots for meshes that an animation or a skin places) come behind them.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -41,8 +41,7 @@ pub(super) fn build(
     let mut kept = vec![false; all.len()];
     for &n in order.iter().rev() {
         let node = &all[n];
-        let skinned = !node["skin"].is_null();
-        let shows = placed.nodes.contains_key(&(n as u32)) && !skinned;
+        let shows = placed.nodes.contains_key(&(n as u32));
         let light = !node["extensions"]["KHR_lights_punctual"].is_null();
         let below = children(node).any(|c| kept[c]);
         kept[n] = shows || below || light || !node["camera"].is_null();
@@ -62,12 +61,14 @@ pub(super) fn build(
     out.roots.extend(roots.iter().filter_map(|r| numbers.get(r)));
     for (n, node) in all.iter().enumerate() {
         let shown = placed.nodes.get(&(n as u32));
-        let skinned = !node["skin"].is_null();
-        if skinned && let Some(shown) = shown {
-            // The transform of a skinned node is ignored: its mesh stands at a root.
+        for (instance, frozen) in placed.posed.get(&(n as u32)).into_iter().flatten() {
             let mut json = Map::new();
-            show(source, placed, (n, shown), meshes, output, warnings, &mut json, &mut add)?;
             copy(node, &["name", "extras"], &mut json);
+            if let Some(instance) = instance {
+                let name = node["name"].as_str().unwrap_or("instance");
+                json.insert("name".into(), format!("{name}#{instance}").into());
+            }
+            meshes.freeze(node, frozen, &mut json, output, warnings)?;
             out.roots.push(add(json.into()));
         }
         if !kept[n] {
@@ -84,7 +85,7 @@ pub(super) fn build(
         if !below.is_empty() {
             json.insert("children".into(), json!(below));
         }
-        if let Some(shown) = shown.filter(|_| !skinned) {
+        if let Some(shown) = shown {
             show(source, placed, (n, shown), meshes, output, warnings, &mut json, &mut add)?;
         }
         out.json.push(json.into());

@@ -6,10 +6,11 @@
 use std::collections::{BTreeMap, HashMap};
 use std::rc::Rc;
 
-use serde_json::{Value, json};
-use sightline_geometry::PrimitiveSet;
+use serde_json::{Map, Value, json};
+use sightline_geometry::{Moment, PrimitiveSet};
 
 use super::Warnings;
+use super::frozen::Frozen;
 use super::output::Output;
 use super::source::{Elements, FLOAT, Shape, Source, index};
 use crate::Scene;
@@ -29,15 +30,28 @@ pub(super) type Shown = Vec<(u32, u32)>;
 pub(super) struct Placed {
     subsets: Vec<Subset>,
     pub(super) nodes: BTreeMap<u32, BTreeMap<Option<u32>, Shown>>,
+    /// The same for what an animation or a skin places.
+    pub(super) posed: BTreeMap<u32, BTreeMap<Option<u32>, Vec<Part>>>,
+}
+
+/// The visible triangles of one instance of the geometry.
+pub(super) struct Part {
+    /// Index into the `primitives` of the glTF mesh.
+    pub(super) primitive: u32,
+    /// Index into the instances of the geometry.
+    pub(super) instance: usize,
+    /// Ascending numbers in its body.
+    pub(super) triangles: Vec<u32>,
 }
 
 /// Sorts a set by node, instance and primitive. The set must be one of the scene.
 pub(super) fn placed(scene: &Scene, set: &PrimitiveSet) -> Placed {
-    let mut placed = Placed { subsets: vec![], nodes: BTreeMap::new() };
+    let mut placed = Placed { subsets: vec![], nodes: BTreeMap::new(), posed: BTreeMap::new() };
     let mut numbers: HashMap<Subset, u32> = HashMap::new();
     let geometry = &scene.geometry;
     let mut runs = set.runs().iter().copied().peekable();
-    for (instance, source) in geometry.instances.iter().zip(&scene.instances) {
+    for (number, (instance, source)) in geometry.instances.iter().zip(&scene.instances).enumerate()
+    {
         let first = instance.first_primitive.0;
         let count = geometry.meshes[instance.mesh.index()].triangles.len() as u32;
         let mut visible = vec![];
@@ -50,6 +64,13 @@ pub(super) fn placed(scene: &Scene, set: &PrimitiveSet) -> Placed {
             runs.next();
         }
         if visible.is_empty() {
+            continue;
+        }
+        if source.posed {
+            let triangles = visible.into_iter().flatten().collect();
+            let part = Part { primitive: source.primitive, instance: number, triangles };
+            let node = placed.posed.entry(source.node).or_default();
+            node.entry(source.gpu_instance).or_default().push(part);
             continue;
         }
         let all = visible.len() == 1 && visible[0].len() == count as usize;
@@ -65,6 +86,9 @@ pub(super) fn placed(scene: &Scene, set: &PrimitiveSet) -> Placed {
     for shown in placed.nodes.values_mut().flat_map(BTreeMap::values_mut) {
         shown.sort_unstable();
     }
+    for parts in placed.posed.values_mut().flat_map(BTreeMap::values_mut) {
+        parts.sort_unstable_by_key(|p| p.primitive);
+    }
     placed
 }
 
@@ -72,6 +96,8 @@ pub(super) fn placed(scene: &Scene, set: &PrimitiveSet) -> Placed {
 pub(super) struct Meshes<'a> {
     source: &'a Source<'a>,
     scene: &'a Scene,
+    /// When what moves is frozen.
+    moment: Moment,
     /// Numbers by glTF mesh, visible primitives and the bits of a node's own weights.
     numbers: HashMap<(usize, Shown, Vec<u64>), usize>,
     primitives: HashMap<(usize, u32, u32, Vec<u64>), Value>,
@@ -82,10 +108,11 @@ pub(super) struct Meshes<'a> {
 }
 
 impl<'a> Meshes<'a> {
-    pub(super) fn new(source: &'a Source<'a>, scene: &'a Scene) -> Self {
+    pub(super) fn new(source: &'a Source<'a>, scene: &'a Scene, moment: Moment) -> Self {
         Self {
             source,
             scene,
+            moment,
             numbers: HashMap::new(),
             primitives: HashMap::new(),
             json: vec![],
@@ -126,11 +153,54 @@ impl<'a> Meshes<'a> {
                 let place = format!("mesh {mesh}, primitive {primitive}");
                 let triangles = self.triangle_numbers(subset);
                 self.triangles += triangles.len() as u64;
-                let value = job.rebuild(&triangles, &place, output, warnings)?;
+                let value = job.rebuild(&triangles, None, &place, output, warnings)?;
                 self.primitives.insert(key.clone(), value);
             }
             primitives.push(self.primitives[&key].clone());
         }
+        let number = self.push(mesh, primitives, warnings);
+        self.numbers.insert(key, number);
+        Some(number)
+    }
+
+    /// Gives a root its mesh and its place: the visible part of a mesh that an animation or a skin
+    /// places, frozen. `None` as for [`Meshes::number`].
+    pub(super) fn freeze(
+        &mut self,
+        node: &Value,
+        parts: &[Part],
+        root: &mut Map<String, Value>,
+        output: &mut Output,
+        warnings: &mut Warnings,
+    ) -> Option<()> {
+        let mesh = index(&node["mesh"])?;
+        let source = self.source;
+        let json = source.entry("meshes", mesh);
+        let mut primitives = Vec::with_capacity(parts.len());
+        let mut place = None;
+        for part in parts {
+            let job =
+                Job { source, json: &json["primitives"][part.primitive as usize], weights: &[] };
+            let mut frozen = Frozen::new(self.scene, part, self.moment, &mut place);
+            frozen.bends |= !node["skin"].is_null();
+            let mut triangles = frozen.of_file();
+            triangles.sort_unstable();
+            self.triangles += triangles.len() as u64;
+            let named = format!("mesh {mesh}, primitive {}", part.primitive);
+            primitives.push(job.rebuild(&triangles, Some(&frozen), &named, output, warnings)?);
+        }
+        let place = place?;
+        root.insert("mesh".into(), self.push(mesh, primitives, warnings).into());
+        root.insert("translation".into(), json!(place.translation.to_array()));
+        if place.mirrored {
+            root.insert("scale".into(), json!([-1.0, 1.0, 1.0]));
+        }
+        Some(())
+    }
+
+    /// Adds a mesh named as in the source.
+    fn push(&mut self, mesh: usize, primitives: Vec<Value>, warnings: &mut Warnings) -> usize {
+        let json = self.source.entry("meshes", mesh);
         let mut out = json!({ "primitives": primitives });
         for key in ["name", "extras"] {
             if let Some(value) = json.get(key) {
@@ -141,8 +211,7 @@ impl<'a> Meshes<'a> {
             warnings.add("extensions of a mesh are left out", format!("mesh {mesh}"));
         }
         self.json.push(out);
-        self.numbers.insert(key, self.json.len() - 1);
-        Some(self.json.len() - 1)
+        self.json.len() - 1
     }
 
     /// Ascending numbers of a subset's triangles in the glTF primitive.
@@ -174,13 +243,20 @@ impl<'a> Job<'a> {
     fn rebuild(
         &self,
         triangles: &[u32],
+        frozen: Option<&Frozen>,
         place: &str,
         output: &mut Output,
         warnings: &mut Warnings,
     ) -> Option<Value> {
         let (mut attributes, corners) = self.read(place, warnings)?;
         let position = attributes.remove("POSITION")?;
-        let position = self.displaced(position)?;
+        let position = match frozen {
+            None => self.displaced(position)?,
+            Some(frozen) => {
+                frozen.directions(&mut attributes, place, warnings)?;
+                frozen.positions(position.count, &corners)?
+            }
+        };
         if self.json["targets"].as_array().is_some_and(|t| !t.is_empty()) {
             warnings.add("morph targets are left out", place);
         }

@@ -2,8 +2,9 @@
 //!
 //! Source: glTF 2.0 specification, sections 3 and 4 (binary layout); EXT_mesh_gpu_instancing.
 //!
-//! The file has one buffer in four views: positions (`f32 x 3`), 16-bit indices, 32-bit indices
-//! and instance attributes. The parts of a mesh share its positions. JSON comes from structs
+//! The file has one buffer in five views: positions and their displacements by morph targets
+//! (`f32 x 3`), 16-bit indices, 32-bit indices, instance attributes, and times and weights of the
+//! animation. What has no bytes has no view. The parts of a mesh share its positions. JSON comes from structs
 //! with fields in a fixed order, so the bytes depend on the document alone.
 //!
 //! Invariants: parents are added before their children; a mesh is written once however many
@@ -25,6 +26,10 @@ pub(super) struct MeshKey(usize);
 /// Number of a node in a document.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct NodeKey(usize);
+
+/// Number of an animation sampler in a document.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct SamplerKey(usize);
 
 /// Where a node stands in its parent's space.
 #[derive(Clone, Copy, Debug)]
@@ -89,6 +94,9 @@ pub(super) struct Document {
     short_indices: Vec<u8>,
     long_indices: Vec<u8>,
     attributes: Vec<u8>,
+    animation: Vec<u8>,
+    samplers: Vec<json::Sampler>,
+    channels: Vec<json::Channel>,
     triangles: u64,
     bounds: Option<Bounds>,
 }
@@ -102,6 +110,7 @@ const POSITIONS: usize = 0;
 const SHORT_INDICES: usize = 1;
 const LONG_INDICES: usize = 2;
 const ATTRIBUTES: usize = 3;
+const ANIMATION: usize = 4;
 
 impl Document {
     pub(super) fn new() -> Self {
@@ -130,21 +139,45 @@ impl Document {
         self.accessors.len() - 1
     }
 
+    /// Adds points or displacements of vertices.
+    fn vertices(&mut self, points: &[[f32; 3]]) -> usize {
+        let bounds = Bounds::of_points(points.iter().map(wide));
+        let byte_offset = self.positions.len();
+        self.positions.extend(points.as_flattened().iter().flat_map(|c| c.to_le_bytes()));
+        self.accessor(json::Accessor {
+            buffer_view: POSITIONS,
+            byte_offset,
+            component_type: FLOAT,
+            count: points.len(),
+            kind: "VEC3",
+            min: Some(bounds.min.to_array().to_vec()),
+            max: Some(bounds.max.to_array().to_vec()),
+        })
+    }
+
     /// Adds a mesh.
     pub(super) fn mesh(&mut self, name: impl Into<String>, solid: &Solid) -> MeshKey {
-        let bounds =
-            Bounds::of_points(solid.positions.iter().map(|p| DVec3::from_array(p.map(f64::from))));
-        let position = self.accessor(json::Accessor {
-            buffer_view: POSITIONS,
-            byte_offset: self.positions.len(),
-            component_type: FLOAT,
-            count: solid.positions.len(),
-            kind: "VEC3",
-            min: Some(bounds.min.to_array()),
-            max: Some(bounds.max.to_array()),
-        });
-        for p in &solid.positions {
-            self.positions.extend(p.iter().flat_map(|c| c.to_le_bytes()));
+        self.morphing_mesh(name, solid, &[])
+    }
+
+    /// Adds a mesh with morph targets: displacements of every vertex, of weight 0 at rest and of weights
+    /// in [-1, 1] otherwise.
+    pub(super) fn morphing_mesh(
+        &mut self,
+        name: impl Into<String>,
+        solid: &Solid,
+        targets: &[Vec<[f32; 3]>],
+    ) -> MeshKey {
+        let position = self.vertices(&solid.positions);
+        let mut bounds = Bounds::of_points(solid.positions.iter().map(wide));
+        let mut displacements = Vec::with_capacity(targets.len());
+        for target in targets {
+            assert_eq!(target.len(), solid.positions.len(), "every vertex has a displacement");
+            displacements.push(json::Target { position: self.vertices(target) });
+        }
+        for (v, p) in solid.positions.iter().enumerate().filter(|_| !targets.is_empty()) {
+            let reach: DVec3 = targets.iter().map(|target| wide(&target[v]).abs()).sum();
+            bounds = bounds.union(Bounds { min: wide(p) - reach, max: wide(p) + reach });
         }
         // 65,535 restarts primitives, so it is no index.
         let short = solid.positions.len() <= 65_535;
@@ -174,9 +207,11 @@ impl Document {
             });
             let material = self.material(part.material);
             let attributes = json::PrimitiveAttributes { position };
-            primitives.push(json::Primitive { attributes, indices, material });
+            let targets = displacements.clone();
+            primitives.push(json::Primitive { attributes, indices, material, targets });
         }
-        let json = json::Mesh { name: name.into(), primitives };
+        let weights = vec![0.0; targets.len()];
+        let json = json::Mesh { name: name.into(), primitives, weights };
         self.meshes.push(MeshEntry { json, triangles: solid.triangle_count(), bounds });
         MeshKey(self.meshes.len() - 1)
     }
@@ -285,18 +320,54 @@ impl Document {
         key
     }
 
+    /// Adds linear motion of the weights of morph targets: ascending times in seconds, and all weights
+    /// of a time after those of the time before it.
+    pub(super) fn weights_sampler(&mut self, times: &[f32], weights: &[f32]) -> SamplerKey {
+        let mut scalars = |values: &[f32], bounds: Option<(f32, f32)>| {
+            let byte_offset = self.animation.len();
+            self.animation.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+            self.accessors.push(json::Accessor {
+                buffer_view: ANIMATION,
+                byte_offset,
+                component_type: FLOAT,
+                count: values.len(),
+                kind: "SCALAR",
+                min: bounds.map(|(first, _)| vec![first.into()]),
+                max: bounds.map(|(_, last)| vec![last.into()]),
+            });
+            self.accessors.len() - 1
+        };
+        let input = scalars(times, times.first().copied().zip(times.last().copied()));
+        let output = scalars(weights, None);
+        self.samplers.push(json::Sampler { input, interpolation: "LINEAR", output });
+        SamplerKey(self.samplers.len() - 1)
+    }
+
+    /// Moves the mesh of a node by its morph targets.
+    pub(super) fn animate_weights(&mut self, node: NodeKey, sampler: SamplerKey) {
+        let target = json::ChannelTarget { node: node.0, path: "weights" };
+        self.channels.push(json::Channel { sampler: sampler.0, target });
+    }
+
     /// Writes the GLB file. A file of more than 4 GiB is [`io::ErrorKind::FileTooLarge`].
     pub(super) fn write(self, generator: String, out: &mut impl Write) -> io::Result<Written> {
-        let sections = [&self.positions, &self.short_indices, &self.long_indices, &self.attributes];
+        let sections = [
+            &self.positions,
+            &self.short_indices,
+            &self.long_indices,
+            &self.attributes,
+            &self.animation,
+        ];
         let targets = [
             Some((ARRAY_BUFFER, Some(12))),
             Some((ELEMENT_ARRAY_BUFFER, None)),
             Some((ELEMENT_ARRAY_BUFFER, None)),
             None,
+            None,
         ];
         // Views of nothing are not allowed: number the others anew.
         let mut buffer_views = vec![];
-        let mut renumbered = [0; 4];
+        let mut renumbered = [0; 5];
         let mut byte_offset = 0;
         for (k, bytes) in sections.iter().enumerate().filter(|(_, b)| !b.is_empty()) {
             renumbered[k] = buffer_views.len();
@@ -315,6 +386,7 @@ impl Document {
         let instanced = self.nodes.iter().any(|n| n.json.extensions.is_some());
         let extensions = instanced.then(|| vec!["EXT_mesh_gpu_instancing"]);
         let unique_triangles = self.meshes.iter().map(|m| m.triangles).sum();
+        let animation = json::Animation { channels: self.channels, samplers: self.samplers };
         let root = json::Root {
             asset: json::Asset { version: "2.0", generator },
             extensions_used: extensions.clone(),
@@ -324,6 +396,7 @@ impl Document {
             nodes: self.nodes.into_iter().map(|n| n.json).collect(),
             meshes: self.meshes.into_iter().map(|m| m.json).collect(),
             materials: self.materials.iter().map(|m| json::Material::of(*m)).collect(),
+            animations: (!animation.channels.is_empty()).then_some([animation]),
             accessors,
             buffer_views,
             buffers: [json::Buffer { byte_length: byte_offset }],
@@ -350,6 +423,10 @@ impl Document {
     }
 }
 
+fn wide(p: &[f32; 3]) -> DVec3 {
+    DVec3::from_array(p.map(f64::from))
+}
+
 /// The parts of glTF's JSON that the generators use; names as in the specification.
 mod json {
     use super::Serialize;
@@ -367,6 +444,8 @@ mod json {
         pub(super) nodes: Vec<Node>,
         pub(super) meshes: Vec<Mesh>,
         pub(super) materials: Vec<Material>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub(super) animations: Option<[Animation; 1]>,
         pub(super) accessors: Vec<Accessor>,
         pub(super) buffer_views: Vec<BufferView>,
         pub(super) buffers: [Buffer; 1],
@@ -423,6 +502,8 @@ mod json {
     pub(super) struct Mesh {
         pub(super) name: String,
         pub(super) primitives: Vec<Primitive>,
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        pub(super) weights: Vec<f64>,
     }
 
     #[derive(Serialize)]
@@ -430,6 +511,39 @@ mod json {
         pub(super) attributes: PrimitiveAttributes,
         pub(super) indices: usize,
         pub(super) material: usize,
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        pub(super) targets: Vec<Target>,
+    }
+
+    #[derive(Clone, Copy, Serialize)]
+    #[serde(rename_all = "UPPERCASE")]
+    pub(super) struct Target {
+        pub(super) position: usize,
+    }
+
+    #[derive(Serialize)]
+    pub(super) struct Animation {
+        pub(super) channels: Vec<Channel>,
+        pub(super) samplers: Vec<Sampler>,
+    }
+
+    #[derive(Serialize)]
+    pub(super) struct Channel {
+        pub(super) sampler: usize,
+        pub(super) target: ChannelTarget,
+    }
+
+    #[derive(Serialize)]
+    pub(super) struct ChannelTarget {
+        pub(super) node: usize,
+        pub(super) path: &'static str,
+    }
+
+    #[derive(Serialize)]
+    pub(super) struct Sampler {
+        pub(super) input: usize,
+        pub(super) interpolation: &'static str,
+        pub(super) output: usize,
     }
 
     #[derive(Serialize)]
@@ -481,9 +595,9 @@ mod json {
         #[serde(rename = "type")]
         pub(super) kind: &'static str,
         #[serde(skip_serializing_if = "Option::is_none")]
-        pub(super) min: Option<[f64; 3]>,
+        pub(super) min: Option<Vec<f64>>,
         #[serde(skip_serializing_if = "Option::is_none")]
-        pub(super) max: Option<[f64; 3]>,
+        pub(super) max: Option<Vec<f64>>,
     }
 
     #[derive(Serialize)]

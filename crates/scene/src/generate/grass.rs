@@ -2,11 +2,17 @@
 //! EXT_mesh_gpu_instancing. The file holds the unique models and 40 bytes an instance.
 //!
 //! The instances are grouped in tiles, one node a tile and model, so that objects are places.
+//!
+//! In the wind, every model has two morph targets, and an animation of their weights moves all
+//! instances of a node together. A reader keeps one body in memory for each mesh and motion, so tiles sway
+//! in one of only [`PHASES`] phases: the models are some 7,000 of the 58,000 unique triangles of the
+//! source's meadow, and four times as many still fit beside its terrain. The terrain rests, and the
+//! scene at rest is that of the meadow without wind.
 
 use glam::{DQuat, DVec3};
 
 use super::Made;
-use super::glb_writer::{Document, MeshKey, Placement};
+use super::glb_writer::{Document, MeshKey, Placement, SamplerKey};
 use super::material::Material;
 use super::random::{Random, sin_cos};
 use super::solid::Solid;
@@ -16,6 +22,15 @@ use super::vegetation::direction;
 const DENSITY: f64 = 6.0;
 /// Tiles along each side of the meadow.
 const TILES: usize = 8;
+
+/// Phases of the wind.
+const PHASES: usize = 4;
+/// Length of a state in the wind, and of a gust, seconds.
+const WIND: (f64, f64) = (0.25, 2.5);
+/// How far the tip of a blade of 0.5 m is displaced by a morph target, metres.
+const SWAY: f64 = 0.04;
+/// Depth of the roots below the ground, metres.
+const ROOT: f64 = 0.06;
 
 // Streams of random numbers.
 const TERRAIN: u64 = 1;
@@ -63,12 +78,13 @@ impl Plan {
     }
 }
 
-/// Makes a meadow of about `triangles` triangles.
-pub(super) fn make(triangles: u64, seed: u64) -> Made {
+/// Makes a meadow of about `triangles` triangles, at rest or with wind over some states.
+pub(super) fn make(triangles: u64, seed: u64, wind: Option<u32>) -> Made {
     let plan = Plan::new(triangles);
     let mut document = Document::new();
     let root = document.node(None, "meadow", None, Placement::IDENTITY);
-    let models = models(&mut document, plan.model, seed);
+    let models = models(&mut document, plan.model, seed, wind.is_some());
+    let phases = wind.map(|states| phases(&mut document, states));
     let terrain_triangles = 2 * (plan.cells * plan.cells) as u64;
 
     // Draw models until the triangles are spent.
@@ -113,12 +129,50 @@ pub(super) fn make(triangles: u64, seed: u64) -> Made {
                 let placements = &tiles[(i * TILES + j) * models.len() + k];
                 if !placements.is_empty() {
                     let name = format!("tile_{i}_{j}/{name}");
-                    document.instanced_node(Some(tile), name, *mesh, placements);
+                    let node = document.instanced_node(Some(tile), name, *mesh, placements);
+                    if let Some(phases) = &phases {
+                        // Neighbours along either side differ.
+                        document.animate_weights(node, phases[(i + 2 * j) % PHASES]);
+                    }
                 }
             }
         }
     }
     Made { document, suggested_region: [-1.0, -1.0, 1.0, 1.0], suggested_eye_height: [1.7, 1.7] }
+}
+
+/// Weights of the two morph targets over the key frames, for each phase: the tips go round an ellipse.
+fn phases(document: &mut Document, states: u32) -> [SamplerKey; PHASES] {
+    let (state, gust) = WIND;
+    let times: Vec<f64> = (0..=states).map(|key| state * f64::from(key)).collect();
+    let seconds: Vec<f32> = times.iter().map(|t| *t as f32).collect();
+    std::array::from_fn(|phase| {
+        let weights: Vec<f32> = times
+            .iter()
+            .flat_map(|t| {
+                let turns = t / gust + phase as f64 / PHASES as f64;
+                let (s, c) = sin_cos(std::f64::consts::TAU * turns);
+                [c as f32, s as f32]
+            })
+            .collect();
+        document.weights_sampler(&seconds, &weights)
+    })
+}
+
+/// Displacements of the vertices by the two morph targets: none at the roots, and more with the square
+/// of the height above them, as a bent rod's; blades beside each other differ a little.
+fn sway(solid: &Solid) -> [Vec<[f32; 3]>; 2] {
+    let displaced = |direction: DVec3, wave: f64| {
+        let of = |p: &[f32; 3]| {
+            let [x, _, z] = p.map(f64::from);
+            // In `f32`, as roots are stored: they do not move at all.
+            let height = f64::from((p[1] + ROOT as f32).max(0.0)) / (0.5 + ROOT);
+            let gust = 0.8 + 0.2 * sin_cos(wave * x + 5.0 * z).0;
+            (SWAY * height * height * gust * direction).as_vec3().to_array()
+        };
+        solid.positions.iter().map(of).collect()
+    };
+    [displaced(DVec3::new(1.0, 0.0, 0.25), 7.0), displaced(DVec3::new(-0.25, 0.0, 0.8), -6.0)]
 }
 
 /// The terrain over |x|, |z| <= `half`.
@@ -138,14 +192,21 @@ fn ground(terrain: &Terrain, half: f64, cells: usize) -> Solid {
 }
 
 /// Four tufts of grass, then three kinds of flowers.
-fn models(document: &mut Document, size: u64, seed: u64) -> Vec<(String, MeshKey)> {
+fn models(document: &mut Document, size: u64, seed: u64, wind: bool) -> Vec<(String, MeshKey)> {
+    let mut add = |name: String, solid: &Solid| {
+        let mesh = if wind {
+            document.morphing_mesh(name.as_str(), solid, &sway(solid))
+        } else {
+            document.mesh(name.as_str(), solid)
+        };
+        (name, mesh)
+    };
     let mut random = Random::new(seed, MODELS);
     let mut models = vec![];
     for (k, share) in [1.0, 1.6, 2.4, 3.6].into_iter().enumerate() {
         let budget = (share * size as f64) as u64;
         let tuft = tuft(&mut random, budget, 0.12 + 0.1 * k as f64);
-        let name = format!("tuft_{k}");
-        models.push((name.clone(), document.mesh(name, &tuft)));
+        models.push(add(format!("tuft_{k}"), &tuft));
     }
     for (petal, name, share) in [
         (Material::RedPetal, "poppy", 1.2),
@@ -153,7 +214,7 @@ fn models(document: &mut Document, size: u64, seed: u64) -> Vec<(String, MeshKey
         (Material::BluePetal, "cornflower", 2.8),
     ] {
         let flowers = flowers(&mut random, (share * size as f64) as u64, petal);
-        models.push((name.into(), document.mesh(name, &flowers)));
+        models.push(add(name.into(), &flowers));
     }
     models
 }
@@ -190,7 +251,7 @@ fn tuft(random: &mut Random, budget: u64, height: f64) -> Solid {
         let (s, c) = sin_cos(random.angle());
         let r = 0.3 * random.unit().sqrt();
         // Roots are below the ground, also where it slopes.
-        let root = DVec3::new(r * s, -0.06, r * c);
+        let root = DVec3::new(r * s, -ROOT, r * c);
         let material = if random.chance(0.85) { Material::Blade } else { Material::DryBlade };
         let height = 0.06 + height * random.between(0.45, 1.1);
         blade(&mut solid, random, root, height, 4, material);
@@ -205,7 +266,7 @@ fn flowers(random: &mut Random, budget: u64, petal: Material) -> Solid {
     while solid.triangle_count() + 60 <= budget {
         let (s, c) = sin_cos(random.angle());
         let r = 0.28 * random.unit().sqrt();
-        let root = DVec3::new(r * s, -0.06, r * c);
+        let root = DVec3::new(r * s, -ROOT, r * c);
         let height = random.between(0.35, 0.7);
         let head =
             root + DVec3::new(random.between(-0.07, 0.07), height, random.between(-0.07, 0.07));
@@ -254,7 +315,7 @@ fn flowers(random: &mut Random, budget: u64, petal: Material) -> Solid {
     }
     // Grass between the stems.
     while solid.triangle_count() + 7 <= budget {
-        let root = DVec3::new(random.between(-0.25, 0.25), -0.06, random.between(-0.25, 0.25));
+        let root = DVec3::new(random.between(-0.25, 0.25), -ROOT, random.between(-0.25, 0.25));
         let height = random.between(0.12, 0.26);
         blade(&mut solid, random, root, height, 4, Material::Blade);
     }

@@ -70,6 +70,49 @@ pub const SCALES: Use = Use {
     dataless_limit: DATALESS_INSTANCES,
 };
 
+/// Elements of samplers and skins that may be zero without data.
+const DATALESS_KEYS: u64 = 1 << 16;
+
+/// Times of a sampler's keys.
+pub const KEY_TIMES: Use = Use {
+    name: "input of a sampler",
+    kind: Type::Scalar,
+    components: &[F32],
+    dataless_limit: DATALESS_KEYS,
+};
+/// Values of a sampler: vectors.
+pub const KEY_VECTORS: Use = Use {
+    name: "output of a sampler",
+    kind: Type::Vec3,
+    components: NUMBERS,
+    dataless_limit: DATALESS_KEYS,
+};
+/// Values of a sampler: quaternions (x, y, z, w).
+pub const KEY_ROTATIONS: Use = Use { kind: Type::Vec4, ..KEY_VECTORS };
+/// Values of a sampler: weights of morph targets.
+pub const KEY_WEIGHTS: Use = Use { kind: Type::Scalar, ..KEY_VECTORS };
+/// Joints that a vertex follows, four in each set.
+pub const JOINTS: Use = Use {
+    name: "JOINTS",
+    kind: Type::Vec4,
+    components: &[U8, U16],
+    dataless_limit: DATALESS_VERTICES,
+};
+/// How much it follows them.
+pub const WEIGHTS: Use = Use {
+    name: "WEIGHTS",
+    kind: Type::Vec4,
+    components: &[F32, U8, U16],
+    dataless_limit: DATALESS_VERTICES,
+};
+/// From the space of a skinned mesh into that of each joint.
+pub const INVERSE_BIND_MATRICES: Use = Use {
+    name: "inverseBindMatrices",
+    kind: Type::Mat4,
+    components: &[F32],
+    dataless_limit: DATALESS_KEYS,
+};
+
 /// Access to the accessors of a scene.
 pub struct Accessors<'a> {
     document: &'a Document,
@@ -147,12 +190,11 @@ impl<'a> Accessors<'a> {
             let found = format!("{kind:?} of {component:?}");
             return Err(Cause::AccessorType { accessor, found, use_as: use_as.name }.into());
         }
-        let components = if kind == Type::Scalar {
-            1
-        } else if kind == Type::Vec3 {
-            3
-        } else {
-            4
+        let components = match kind {
+            Type::Scalar => 1,
+            Type::Vec3 => 3,
+            Type::Mat4 => 16,
+            _ => 4,
         };
         let size = (components * component.size()) as u64;
         let count = json.count.0;

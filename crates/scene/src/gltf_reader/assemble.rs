@@ -5,13 +5,16 @@ use sightline_geometry::{Bounds, Instance, InstancedGeometry, MeshId, ObjectId, 
 
 use super::{
     MAX_COORDINATE,
+    animation::Animations,
     buffers::Buffers,
     document::{Document, Material},
     nodes::{Placed, node_name},
     primitives::{PlacedBody, Unique},
 };
 use crate::{
-    Cause, IngestReport, InstanceSource, MeshSource, Object, OpenOptions, Scene, SceneError, morton,
+    Cause, IngestReport, InstanceSource, MeshSource, Object, OpenOptions, Scene, SceneDigest,
+    SceneError, morton,
+    particles::{self, Tables, merge_key_times},
 };
 
 /// The see-through patterns of the options.
@@ -47,7 +50,9 @@ pub fn scene(
     document: &Document,
     buffers: &Buffers,
     placed: Placed,
-    unique: Unique,
+    mut unique: Unique,
+    tables: Tables,
+    animations: Animations,
     see_through: &GlobSet,
 ) -> Result<Scene, SceneError> {
     check_count(&unique)?;
@@ -56,7 +61,7 @@ pub fn scene(
     let bounds = drafts.iter().fold(Bounds::EMPTY, |b, d| b.union(d.bounds));
     drafts.sort_by_cached_key(|d| (morton(d.bounds.center(), bounds), d.node));
 
-    let mut report = report(document, &placed, &unique);
+    let mut report = report(document, &placed, &unique, animations);
     let mut instances = Vec::with_capacity(unique.instances.len());
     let mut sources = Vec::with_capacity(unique.instances.len());
     let mut objects = Vec::with_capacity(drafts.len());
@@ -72,6 +77,7 @@ pub fn scene(
         });
         let mut hides = false;
         for i in order {
+            let motion = unique.instances[i].motion.take();
             let placed_body = &unique.instances[i];
             let triangles = unique.bodies[placed_body.body as usize].mesh.triangles.len() as u32;
             let occluder = !draft.matches_pattern
@@ -86,12 +92,13 @@ pub fn scene(
                 world_from_mesh: placed_body.world_from_mesh,
                 first_primitive: PrimitiveId(next),
                 occluder,
-                motion: None,
+                motion,
             });
             sources.push(InstanceSource {
                 node: draft.node,
                 gpu_instance: placed_body.gpu_instance,
                 primitive: placed_body.primitive,
+                posed: placed.placements[placed_body.placement as usize].posed,
                 double_sided: material(document, &placed, placed_body)
                     .is_some_and(|m| m.double_sided),
             });
@@ -109,18 +116,45 @@ pub fn scene(
     }
     let (bodies, meshes): (Vec<_>, Vec<MeshSource>) =
         unique.bodies.into_iter().map(|b| (b.mesh, b.source)).unzip();
-    let geometry = InstancedGeometry::new(bodies, instances);
+    let digest = SceneDigest::of_files([buffers.files(), &tables.files()].concat());
+    let mut parts = tables.key_times();
+    // Where bodies move, these are among theirs already.
+    parts.push(&unique.key_times);
+    let key_times = merge_key_times(&parts);
+    let placed = tables.place(&key_times, objects.len() as u32, next, see_through)?;
+    objects.extend(placed.objects);
+    let states = particles::states(&key_times);
+    let geometry = InstancedGeometry::with_motion(bodies, instances, placed.systems, states);
     count(&mut report, &geometry, objects.len());
-    Ok(Scene { geometry, objects, meshes, instances: sources, report, digest: buffers.digest() })
+    Ok(Scene {
+        geometry,
+        objects,
+        meshes,
+        instances: sources,
+        particles: placed.sources,
+        key_times,
+        report,
+        digest,
+    })
 }
 
 fn count(report: &mut IngestReport, geometry: &InstancedGeometry, objects: usize) {
     report.unique_triangles = geometry.unique_triangle_count() as u64;
-    report.instanced_triangles = u64::from(geometry.primitive_count());
+    report.instanced_triangles = u64::from(geometry.triangle_count());
     report.unique_vertices = geometry.meshes.iter().map(|m| m.positions.len() as u64).sum();
     report.objects = objects as u64;
     report.meshes = geometry.meshes.len() as u64;
     report.instances = geometry.instances.len() as u64;
+    report.count_particles(&geometry.particles);
+    report.states = u64::from(geometry.states);
+    let moves =
+        |i: &&Instance| i.motion.is_some() || geometry.meshes[i.mesh.index()].motion.is_some();
+    let mut last = None;
+    for instance in geometry.instances.iter().filter(moves) {
+        report.moving_triangles += geometry.meshes[instance.mesh.index()].triangles.len() as u64;
+        // The instances of an object follow each other.
+        report.moving_objects += u64::from(last.replace(instance.object) != Some(instance.object));
+    }
 }
 
 /// Refuses scenes with more triangles than primitive numbers.
@@ -131,14 +165,20 @@ fn check_count(unique: &Unique) -> Result<(), SceneError> {
     if count > limit { Err(Cause::TooManyTriangles { count, limit }.into()) } else { Ok(()) }
 }
 
-/// World boxes of the instances.
+/// World boxes of the instances, over all key frames.
 fn boxes(placed: &Placed, unique: &Unique) -> Result<Vec<Bounds>, SceneError> {
     unique
         .instances
         .iter()
         .map(|instance| {
             let mesh = &unique.bodies[instance.body as usize].mesh;
-            let bounds = mesh.bounds.transformed(&instance.world_from_mesh);
+            let bounds = match instance.motion.as_deref() {
+                None => mesh.bounds.transformed(&instance.world_from_mesh),
+                Some(maps) => (0..)
+                    .zip(maps)
+                    .map(|(key, map)| mesh.bounds_at(key).transformed(map))
+                    .fold(Bounds::EMPTY, Bounds::union),
+            };
             let farthest = bounds.min.abs().max(bounds.max.abs()).max_element();
             // Also refuses NaN.
             if farthest <= MAX_COORDINATE {
@@ -192,7 +232,12 @@ fn material<'a>(
 }
 
 /// The report without its counts of what is in the geometry.
-fn report(document: &Document, placed: &Placed, unique: &Unique) -> IngestReport {
+fn report(
+    document: &Document,
+    placed: &Placed,
+    unique: &Unique,
+    animations: Animations,
+) -> IngestReport {
     let (used_extensions, ignored_extensions) = document.extensions();
     let mut warnings = placed.warnings.sentences();
     warnings.extend(unique.warnings.iter().cloned());
@@ -205,6 +250,11 @@ fn report(document: &Document, placed: &Placed, unique: &Unique) -> IngestReport
         hidden_nodes: placed.hidden_nodes,
         animated: !document.animations.is_empty(),
         animations: document.animations.len() as u64,
+        animation_names: animations.names,
+        animations_taken: animations.taken,
+        duration_s: animations.duration,
+        ignored_channels: animations.ignored.into_values().collect(),
+        jumps: unique.jumps,
         skinned_objects: placed.placements.iter().filter(|p| p.skinned).count() as u64,
         flattened_instances: unique.flattened_instances,
         used_extensions,

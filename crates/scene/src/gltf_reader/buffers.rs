@@ -13,7 +13,7 @@ use super::{
     meshopt_view::{self, MeshoptView},
     uri::{self, Target},
 };
-use crate::{Cause, SceneDigest, SceneError};
+use crate::{Cause, SceneError};
 
 /// The two names of the same compression.
 const MESHOPT: [&str; 2] = ["EXT_meshopt_compression", "KHR_meshopt_compression"];
@@ -89,9 +89,9 @@ impl<'a> Buffers<'a> {
         Ok(buffers)
     }
 
-    /// Hashes of the main file and of the external buffers.
-    pub fn digest(&self) -> SceneDigest {
-        SceneDigest::of_files(self.files.clone())
+    /// Names, sizes and hashes of the main file and of the external buffers.
+    pub fn files(&self) -> &[(String, u64, blake3::Hash)] {
+        &self.files
     }
 
     fn open(&mut self, path: &Path, buffer: u32, uri: &str) -> Result<Bytes<'a>, SceneError> {

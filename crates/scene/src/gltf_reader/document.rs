@@ -2,27 +2,26 @@
 //!
 //! Accessors, views, buffers, meshes and scenes have the types of the `gltf` crate. Nodes have a
 //! type of their own, because transforms are composed in `f64` and the crate reads `f32`.
-//! Animations, textures, images, cameras and skins are not read: only their number counts.
+//! Animations and skins are kept as they are, and read where they are used: a broken one that nothing
+//! uses refuses nothing. Textures, images and cameras are not read.
 
 use std::collections::BTreeMap;
 
 use gltf::json;
-use serde::{
-    Deserialize,
-    de::{DeserializeOwned, IgnoredAny},
-};
+use serde::{Deserialize, de::DeserializeOwned};
 use serde_json::{Map, Value};
 
 use crate::{Cause, SceneError};
 
 /// Extensions that this reader applies.
-const APPLIED: [&str; 6] = [
+const APPLIED: [&str; 7] = [
     "KHR_mesh_quantization",
     "EXT_mesh_gpu_instancing",
     "EXT_meshopt_compression",
     "KHR_meshopt_compression",
     "KHR_draco_mesh_compression",
     "KHR_node_visibility",
+    "KHR_animation_pointer",
 ];
 
 /// Applied in part: decides whether a material can be seen through.
@@ -30,11 +29,10 @@ const TRANSMISSION: &str = "KHR_materials_transmission";
 
 /// Beginnings of the names of extensions that leave every triangle where it is, so that a file
 /// which requires them can still be read.
-const APPEARANCE: [&str; 17] = [
+const APPEARANCE: [&str; 16] = [
     "KHR_materials_",
     "KHR_texture_",
     "KHR_lights_",
-    "KHR_animation_pointer",
     "KHR_techniques_webgl",
     "KHR_xmp",
     "KHR_audio",
@@ -73,7 +71,9 @@ pub struct Document {
     #[serde(default)]
     pub scenes: Vec<Roots>,
     #[serde(default)]
-    pub animations: Vec<IgnoredAny>,
+    pub animations: Vec<Value>,
+    #[serde(default)]
+    pub skins: Vec<Value>,
     #[serde(default)]
     pub extensions_used: Vec<String>,
     #[serde(default)]
@@ -267,6 +267,15 @@ pub fn extension<T: DeserializeOwned>(
     serde_json::from_value(value.clone())
         .map(Some)
         .map_err(|e| Cause::ExtensionMalformed { extension: name, reason: describe(&e) }.into())
+}
+
+/// An animation or a skin in its type.
+pub fn part<T: DeserializeOwned>(value: &Value) -> Result<T, SceneError> {
+    T::deserialize(value).or_else(|e| {
+        let mut integral = value.clone();
+        make_integral(&mut integral);
+        T::deserialize(&integral).map_err(|_| Cause::PartMalformed { reason: describe(&e) }.into())
+    })
 }
 
 /// Parses JSON in which integers are written as `1.0` or `1e0`, which the specification allows

@@ -36,16 +36,19 @@ pub struct DracoPrimitive {
 pub struct Decoded {
     pub positions: Vec<[f32; 3]>,
     pub triangles: Vec<[u32; 3]>,
+    /// Other attributes, of four numbers a vertex.
+    pub others: Vec<Vec<[f32; 4]>>,
 }
 
-/// Decodes vertex positions and triangles. `position` is the unique id of the attribute.
-pub fn decode(source: &[u8], position: u32) -> Result<Decoded, SceneError> {
-    catch_unwind(AssertUnwindSafe(|| decode_unguarded(source, position)))
+/// Decodes vertex positions, triangles, and other attributes of four numbers. `position` and `others`
+/// are the unique ids of the attributes.
+pub fn decode(source: &[u8], position: u32, others: &[u32]) -> Result<Decoded, SceneError> {
+    catch_unwind(AssertUnwindSafe(|| decode_unguarded(source, position, others)))
         .unwrap_or_else(|_| Err("the decoder failed".into()))
         .map_err(|reason| Cause::Draco { reason }.into())
 }
 
-fn decode_unguarded(source: &[u8], position: u32) -> Result<Decoded, String> {
+fn decode_unguarded(source: &[u8], position: u32, others: &[u32]) -> Result<Decoded, String> {
     let bytes = (source.len() as u64 * MAX_EXPANSION).clamp(ALWAYS_ALLOWED, NEVER_ALLOWED);
     let limits = DecodeLimits::default()
         .with_max_points(bytes / 12)
@@ -64,5 +67,13 @@ fn decode_unguarded(source: &[u8], position: u32) -> Result<Decoded, String> {
     let positions = attribute.read_f32s(mesh.num_points(), 3);
     let positions = positions.as_chunks::<3>().0.to_vec();
     let triangles = mesh.faces().iter().map(|f| f.map(|p| p.0)).collect();
-    Ok(Decoded { positions, triangles })
+    let four = |&id: &u32| {
+        let attribute = mesh
+            .attribute_by_unique_id(id)
+            .filter(|a| a.num_components() == 4)
+            .ok_or_else(|| format!("there is no attribute {id} of four numbers"))?;
+        Ok(attribute.read_f32s(mesh.num_points(), 4).as_chunks::<4>().0.to_vec())
+    };
+    let others = others.iter().map(four).collect::<Result<_, String>>()?;
+    Ok(Decoded { positions, triangles, others })
 }

@@ -2,23 +2,26 @@
 //!
 //! Source: Khronos, "glTF 2.0 Specification"; the extensions KHR_mesh_quantization,
 //! EXT_mesh_gpu_instancing, EXT_ and KHR_meshopt_compression, KHR_draco_mesh_compression,
-//! KHR_node_visibility.
+//! KHR_node_visibility, KHR_animation_pointer.
 //!
 //! The steps, one module each:
 //! 1. `container`: a `.glb` file into its JSON and binary chunks;
 //! 2. `document`: the JSON into the types of the `gltf` crate, without what triangles do not
-//!    need, so that a broken animation or texture refuses nothing;
+//!    need, so that a broken texture, or an animation that is not asked for, refuses nothing;
 //! 3. `uri`, `buffers`: external, embedded and data-URI buffers; views, decompressed by
 //!    `meshopt_view` where they are compressed;
-//! 4. `nodes`, `gpu_instancing`: the default scene into placements in `f64`;
-//! 5. `accessors`, `draco`, `primitives`: triangles of each unique primitive, in parallel;
-//! 6. `assemble`: numbering, objects, report.
+//! 4. `animation`: what moves, from the channels of the animation that the options choose;
+//! 5. `nodes`, `gpu_instancing`: the default scene into placements in `f64`;
+//! 6. `accessors`, `draco`, `primitives`: triangles of each unique primitive, in parallel, and where
+//!    they are at the key frames;
+//! 7. `assemble`: numbering, objects, report.
 //!
 //! The `gltf` crate's own accessor iterators and validation are not used: they panic on ranges
 //! that are out of bounds. Every count is checked against the bytes behind it before memory is
 //! reserved; what has no bytes behind it has a limit of its own.
 
 mod accessors;
+mod animation;
 mod assemble;
 pub(crate) mod buffers;
 pub(crate) mod container;
@@ -32,7 +35,8 @@ pub(crate) mod uri;
 
 use std::path::Path;
 
-use crate::{Cause, OpenOptions, Scene, SceneDigest, SceneError};
+use crate::{Cause, OpenOptions, Scene, SceneError, particles::Tables};
+pub use assemble::see_through_patterns;
 
 /// Largest coordinate of a used vertex and of anything in the world, metres (a tenth of a light
 /// year). Keeps areas and volumes of boxes finite in `f32` hierarchies.
@@ -45,23 +49,31 @@ pub fn read(path: &Path, options: &OpenOptions) -> Result<Scene, SceneError> {
 
 /// Reads and numbers a scene whose main file is in memory.
 pub fn read_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Scene, SceneError> {
-    let see_through = assemble::see_through_patterns(options)?;
+    let see_through = see_through_patterns(options)?;
+    let error = options.motion_error;
+    if !(error > 0.0 && error.is_finite()) {
+        return Err(Cause::MotionError { error }.into());
+    }
     let parts = container::split(main)?;
     let document = document::Document::parse(parts.json)?;
     document.check_extensions()?;
     let buffers = buffers::Buffers::load(path, main, parts.binary, &document)?;
     let accessors = accessors::Accessors::new(&document, &buffers);
-    let placed = nodes::placements(&document, &accessors, options)?;
-    let unique = primitives::collect(&document, &accessors, &placed, options)?;
-    assemble::scene(&document, &buffers, placed, unique, &see_through)
+    let mut animations = animation::read(&document, &accessors, &options.animation)?;
+    let placed = nodes::placements(&document, &accessors, &animations, options)?;
+    animations.ignore_nodes_outside(|node| placed.has(node));
+    let tables = Tables::read(options)?;
+    let times = tables.key_times();
+    let unique = primitives::collect(&document, &accessors, &placed, &animations, &times, options)?;
+    assemble::scene(&document, &buffers, placed, unique, tables, animations, &see_through)
 }
 
-/// Hashes the files of a scene.
-pub fn digest(path: &Path) -> Result<SceneDigest, SceneError> {
+/// Names, sizes and hashes of the files of a scene.
+pub fn files(path: &Path) -> Result<Vec<(String, u64, blake3::Hash)>, SceneError> {
     let main = read_main_file(path)?;
     let parts = container::split(&main)?;
     let document = document::Document::parse(parts.json)?;
-    Ok(buffers::Buffers::load(path, &main, parts.binary, &document)?.digest())
+    Ok(buffers::Buffers::load(path, &main, parts.binary, &document)?.files().to_vec())
 }
 
 fn read_main_file(path: &Path) -> Result<Vec<u8>, SceneError> {

@@ -2,9 +2,10 @@
 //!
 //! Promise: every node is visited at most once, without recursion; a node that is its own
 //! ancestor or has two parents is an error. The transform of a skinned node is ignored, as the
-//! specification asks: its vertices are taken where the file stores them.
+//! specification asks: its joints place its vertices.
 //!
-//! Composition: world = parent * T * R * S, or parent * matrix. Rotations are normalized.
+//! Composition: world = parent * T * R * S, or parent * matrix. Rotations are normalized. What an
+//! animation moves is in the rig; what it only poses stands as it does at time 0.
 
 use std::collections::BTreeMap;
 
@@ -12,6 +13,11 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 
 use super::{
     accessors::Accessors,
+    animation::{
+        Animations, NodeTracks,
+        rig::{Local, Rig},
+        skin,
+    },
     document::{Document, Node, shorten},
     gpu_instancing,
 };
@@ -30,12 +36,17 @@ pub struct Placement {
     pub node: u32,
     /// Index into `meshes`.
     pub mesh: u32,
-    /// World from mesh; one for each instance of EXT_mesh_gpu_instancing.
+    /// The node that carries the mesh through the world: itself, where it moves.
+    pub carrier: Option<u32>,
+    /// Carrier from mesh, or world from mesh where there is no carrier; one for each instance of
+    /// EXT_mesh_gpu_instancing.
     pub transforms: Vec<DAffine3>,
     /// True when the transforms are those of EXT_mesh_gpu_instancing.
     pub gpu_instanced: bool,
     /// True for a node with a skin.
     pub skinned: bool,
+    /// True when an animation places it, or may, rather than the nodes of the file.
+    pub posed: bool,
 }
 
 /// Warnings by sentence, with how often and where first.
@@ -64,6 +75,8 @@ impl Warnings {
 pub struct Placed {
     /// Nodes with a mesh.
     pub placements: Vec<Placement>,
+    /// What moves, and joints.
+    pub rig: Rig,
     /// Parent of each node that was reached, `NO_PARENT` for roots.
     parents: Vec<u32>,
     /// Nodes with a mesh that are switched off.
@@ -106,10 +119,13 @@ pub fn node_name(document: &Document, node: u32) -> Option<String> {
 pub fn placements(
     document: &Document,
     accessors: &Accessors,
+    animations: &Animations,
     options: &OpenOptions,
 ) -> Result<Placed, SceneError> {
+    let joints = skin::joints(document);
     let mut placed = Placed {
         placements: Vec::new(),
+        rig: Rig::default(),
         parents: vec![UNREACHED; document.nodes.len()],
         hidden_nodes: 0,
         warnings: Warnings::default(),
@@ -125,6 +141,8 @@ pub fn placements(
             depth: 1,
             world_from_parent: DAffine3::IDENTITY,
             hidden: false,
+            moves: false,
+            posed: false,
         })
         .collect();
     while let Some(visit) = stack.pop() {
@@ -134,27 +152,42 @@ pub fn placements(
             parent => format!("node {parent}"),
         })?;
         placed.reach(&visit)?;
-        let world_from_node = visit.world_from_parent
-            * local(index, node, &mut placed.warnings).map_err(|e| e.at_node(index as usize))?;
+        let tracks = animations.nodes.get(&index);
+        let local = local(index, node, tracks, &mut placed.warnings)
+            .map_err(|e| e.at_node(index as usize))?;
+        let world_from_node = visit.world_from_parent * local.at(0.0);
         if !world_from_node.is_finite() {
             return Err(SceneError::from(Cause::TransformNotFinite).at_node(index as usize));
+        }
+        let moves = visit.moves || tracks.is_some_and(NodeTracks::moves);
+        let posed = visit.posed || tracks.is_some_and(NodeTracks::poses);
+        if moves {
+            placed.rig.add_moving(index, visit.parent, visit.world_from_parent, local);
+        } else if joints.contains(&index) {
+            placed.rig.add_resting(index, world_from_node);
         }
         let hidden =
             visit.hidden || node.extensions.visibility.as_ref().is_some_and(|v| !v.visible);
         match node.mesh {
             Some(_) if hidden => placed.hidden_nodes += 1,
             Some(mesh) => {
-                let placement = place(document, accessors, index, mesh, world_from_node)
+                let (frame, carrier) = match moves {
+                    true => (DAffine3::IDENTITY, Some(index)),
+                    false => (world_from_node, None),
+                };
+                let placement = place(document, accessors, index, mesh, frame)
                     .map_err(|e| e.at_node(index as usize))?;
+                let weights = animations.weights(index).is_some();
+                let placement = Placement {
+                    carrier: carrier.filter(|_| !placement.skinned),
+                    posed: posed || weights || placement.skinned,
+                    ..placement
+                };
                 let primitives = document.meshes[mesh as usize].primitives.len() as u64;
                 instances += primitives * placement.transforms.len() as u64;
                 let limit = options.max_instances;
                 if instances > limit {
                     return Err(Cause::TooManyInstances { count: instances, limit }.into());
-                }
-                if placement.skinned {
-                    let sentence = "a skinned mesh is read in the pose that the file stores";
-                    placed.warnings.add(sentence, || format!("node {index}"));
                 }
                 placed.placements.push(placement);
             }
@@ -166,6 +199,8 @@ pub fn placements(
             depth: visit.depth + 1,
             world_from_parent: world_from_node,
             hidden,
+            moves,
+            posed,
         }));
     }
     placed.placements.sort_unstable_by_key(|p| p.node);
@@ -179,9 +214,18 @@ struct Visit {
     depth: u32,
     world_from_parent: DAffine3,
     hidden: bool,
+    /// True below a node that an animation moves.
+    moves: bool,
+    /// True below a node that an animation poses.
+    posed: bool,
 }
 
 impl Placed {
+    /// True for nodes of the default scene.
+    pub fn has(&self, node: u32) -> bool {
+        self.parents.get(node as usize).is_some_and(|&p| p != UNREACHED)
+    }
+
     /// Notes a node's parent; refuses cycles, second parents and deep nesting.
     fn reach(&mut self, visit: &Visit) -> Result<(), SceneError> {
         let node = visit.node;
@@ -208,27 +252,33 @@ fn place(
     accessors: &Accessors,
     index: u32,
     mesh: u32,
-    world_from_node: DAffine3,
+    frame_from_node: DAffine3,
 ) -> Result<Placement, SceneError> {
     let node = &document.nodes[index as usize];
     Document::get(&document.meshes, "mesh", mesh, || format!("node {index}"))?;
     let skinned = node.skin.is_some();
-    let world_from_mesh = if skinned { DAffine3::IDENTITY } else { world_from_node };
+    let frame_from_mesh = if skinned { DAffine3::IDENTITY } else { frame_from_node };
     let (transforms, gpu_instanced) = match &node.extensions.gpu_instancing {
         Some(extension) => {
             let locals = gpu_instancing::transforms(accessors, &extension.attributes)?;
-            (locals.into_iter().map(|local| world_from_mesh * local).collect(), true)
+            (locals.into_iter().map(|local| frame_from_mesh * local).collect(), true)
         }
-        None => (vec![world_from_mesh], false),
+        None => (vec![frame_from_mesh], false),
     };
     if transforms.iter().any(|t: &DAffine3| !t.is_finite()) {
         return Err(Cause::TransformNotFinite.into());
     }
-    Ok(Placement { node: index, mesh, transforms, gpu_instanced, skinned })
+    let (carrier, posed) = (None, false);
+    Ok(Placement { node: index, mesh, carrier, transforms, gpu_instanced, skinned, posed })
 }
 
 /// Parent from node.
-fn local(index: u32, node: &Node, warnings: &mut Warnings) -> Result<DAffine3, SceneError> {
+fn local(
+    index: u32,
+    node: &Node,
+    tracks: Option<&NodeTracks>,
+    warnings: &mut Warnings,
+) -> Result<Local, SceneError> {
     let trs = node.translation.is_some() || node.rotation.is_some() || node.scale.is_some();
     let place = || match &node.name {
         Some(name) => format!("node {index}, `{}`", shorten(name)),
@@ -245,10 +295,11 @@ fn local(index: u32, node: &Node, warnings: &mut Warnings) -> Result<DAffine3, S
         }
         let column = |k: usize| DVec3::new(m[4 * k], m[4 * k + 1], m[4 * k + 2]);
         let matrix3 = DMat3::from_cols(column(0), column(1), column(2));
-        return Ok(DAffine3 { matrix3, translation: column(3) });
+        return Ok(Local::fixed(DAffine3 { matrix3, translation: column(3) }));
     }
-    if !trs {
-        return Ok(DAffine3::IDENTITY);
+    let tracks = tracks.filter(|t| t.poses());
+    if !trs && tracks.is_none() {
+        return Ok(Local::fixed(DAffine3::IDENTITY));
     }
     let rotation = match node.rotation {
         Some(q) => {
@@ -260,11 +311,14 @@ fn local(index: u32, node: &Node, warnings: &mut Warnings) -> Result<DAffine3, S
         }
         None => DQuat::IDENTITY,
     };
-    Ok(DAffine3::from_scale_rotation_translation(
+    if let Some(tracks) = tracks {
+        return Ok(Local::posed(node, rotation, tracks));
+    }
+    Ok(Local::fixed(DAffine3::from_scale_rotation_translation(
         node.scale.map_or(DVec3::ONE, DVec3::from_array),
         rotation,
         node.translation.map_or(DVec3::ZERO, DVec3::from_array),
-    ))
+    )))
 }
 
 /// A quaternion (x, y, z, w), normalized.

@@ -7,8 +7,18 @@
 //! An instance's transform must be invertible. A scale of zero on one axis flattens a mesh that
 //! may still be seen, so such an instance gets a body of its own with the transform's linear
 //! part applied; what collapses to a line or a point is degenerate and dropped.
+//!
+//! What moves: an instance whose node moves has a transform a key frame. A body whose vertices move on
+//! their own, by a skin or by weights of morph targets, is one of its node alone and has positions
+//! a key frame; skins are in the world, so they are their own even at rest. Key frames are chosen when
+//! the boxes of all that moves are known. A moving transform may be singular at a key frame, or at all
+//! of them: then the instance stays as it is, but for one whose triangles are lines or points at every key frame,
+//! which is dropped.
 
-use std::collections::HashMap;
+use std::{
+    collections::{BTreeMap, HashMap},
+    sync::Arc,
+};
 
 use glam::{DAffine3, DMat3, DVec3};
 use gltf::{
@@ -16,18 +26,26 @@ use gltf::{
     mesh::Semantic,
 };
 use rayon::prelude::*;
-use sightline_geometry::Mesh;
+use sightline_geometry::{Bounds, Mesh};
 
 use super::{
     MAX_COORDINATE,
     accessors::{Accessors, INDICES, POSITIONS},
+    animation::{
+        Animations,
+        bend::{Mover, Part},
+        deform::{Soft, corners as corners_of},
+        key_frames::{self, KeyFrames},
+        rig::Rig,
+        skin::{Influences, Sets, Skin},
+    },
     document::{Document, extension},
     draco::{self, Decoded, DracoPrimitive},
     nodes::{Placed, Warnings},
 };
 use crate::{
     Cause, DegenerateTriangles, MeshSource, OpenOptions, SceneError, SkippedPrimitives,
-    degenerate::is_degenerate, report::LISTED_DEGENERATE_TRIANGLES,
+    degenerate::is_degenerate, particles::merge_key_times, report::LISTED_DEGENERATE_TRIANGLES,
 };
 
 /// What makes the triangles of a body.
@@ -38,6 +56,19 @@ struct Key {
     morph: Vec<(u32, u32)>,
     /// Bits of the linear part of a singular transform, by columns.
     flatten: Option<[u64; 9]>,
+    /// What moves the vertices.
+    deform: Option<Deform>,
+}
+
+/// What moves the vertices of a body on their own.
+#[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+struct Deform {
+    /// The node that shows it, alone.
+    node: u32,
+    /// Index into `skins`, and where joints and weights are.
+    skin: Option<(u32, Sets)>,
+    /// Numbers of the morph targets with positions, and their accessors, where weights change.
+    targets: Vec<(u32, u32)>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -78,8 +109,10 @@ pub struct PlacedBody {
     pub gpu_instance: Option<u32>,
     /// Index into the `primitives` of the glTF mesh.
     pub primitive: u32,
-    /// World from body, invertible.
+    /// World from body at the first key frame; invertible where `motion` is `None`.
     pub world_from_mesh: DAffine3,
+    /// World from body at every key frame, where it changes.
+    pub motion: Option<Box<[DAffine3]>>,
 }
 
 /// All bodies and where they stand.
@@ -91,36 +124,62 @@ pub struct Unique {
     pub degenerate: Vec<DegenerateTriangles>,
     pub skipped: SkippedPrimitives,
     pub flattened_instances: u64,
+    /// Times of the key frames, seconds.
+    pub key_times: Vec<f64>,
+    /// Number of times at which something jumps.
+    pub jumps: u64,
     pub warnings: Vec<String>,
 }
 
-/// Reads every body that the placements need.
+/// Reads every body that the placements need, and places all at the key frames. `table_times` are the
+/// key times of the particle tables of the scene.
 pub fn collect(
     document: &Document,
     accessors: &Accessors,
     placed: &Placed,
+    animations: &Animations,
+    table_times: &[&[f64]],
     options: &OpenOptions,
 ) -> Result<Unique, SceneError> {
     let mut survey = Survey::default();
-    for (index, placement) in placed.placements.iter().enumerate() {
+    for index in 0..placed.placements.len() {
+        let place = Place { document, accessors, placed, animations };
         survey
-            .placement(document, accessors, placed, index as u32)
-            .map_err(|e| e.at_node(placement.node as usize))?;
+            .placement(&place, index as u32)
+            .map_err(|e| e.at_node(placed.placements[index].node as usize))?;
     }
-    let Survey { jobs, mut instances, skipped, flattened, warnings, .. } = survey;
+    let Survey { jobs, mut instances, skipped, flattened, mut warnings, skins, .. } = survey;
     check_size(&jobs, accessors, options)?;
 
     // Bodies are numbered by the first glTF primitive that needs them, whatever node came first.
     let mut order: Vec<usize> = (0..jobs.len()).collect();
     order.sort_unstable_by_key(|&j| (jobs[j].mesh, jobs[j].primitive, &jobs[j].key));
+    let deforming = Deforming { skins, animations };
     let read: Vec<Result<Read, SceneError>> = order
         .par_iter()
         .map(|&j| {
             let job = &jobs[j];
-            read(job, accessors)
+            read(job, accessors, &deforming)
                 .map_err(|e| e.at_primitive(job.mesh as usize, job.primitive as usize))
         })
         .collect();
+    // The first error in the order of the file, whichever thread met one first.
+    let read: Vec<Read> = read.into_iter().collect::<Result<_, _>>()?;
+    let mut read_of_job = vec![0; jobs.len()];
+    for (r, &j) in order.iter().enumerate() {
+        read_of_job[j] = r;
+    }
+
+    let movers = movers(&jobs, &read, &read_of_job, &instances, placed);
+    let KeyFrames { times, jumps } =
+        key_frames::choose(&placed.rig, movers, animations.duration, options)?;
+    // What moves has the key frames of all that moves.
+    let times = if times.len() > 1 {
+        merge_key_times(&[&[times.as_slice()], table_times].concat())
+    } else {
+        times
+    };
+    check_moving(&read, &instances, placed, times.len(), options)?;
 
     let mut out = Unique {
         bodies: Vec::new(),
@@ -128,33 +187,214 @@ pub fn collect(
         degenerate: Vec::new(),
         skipped,
         flattened_instances: flattened,
+        key_times: times,
+        jumps,
         warnings: Vec::new(),
     };
-    let mut warnings: Warnings = warnings;
+    let built: Vec<Result<Built, SceneError>> = order
+        .par_iter()
+        .zip(read)
+        .map(|(&j, read)| {
+            let job = &jobs[j];
+            build(job, read, &placed.rig, &out.key_times)
+                .map_err(|e| e.at_primitive(job.mesh as usize, job.primitive as usize))
+        })
+        .collect();
     const EMPTY: u32 = u32::MAX;
     let mut body_of_job = vec![EMPTY; jobs.len()];
-    for (&j, read) in order.iter().zip(read) {
-        // The first error in the order of the file, whichever thread met one first.
-        let read = read?;
-        if read.odd_indices {
+    let mut centers = Vec::new();
+    for (&j, built) in order.iter().zip(built) {
+        let built = built?;
+        if built.odd_indices {
             let sentence = "indices at the end of a primitive make no triangle";
             warnings.add(sentence, || {
                 format!("mesh {}, primitive {}", jobs[j].mesh, jobs[j].primitive)
             });
         }
-        out.degenerate.extend(read.degenerate);
-        if let Some(body) = read.body {
+        out.degenerate.extend(built.degenerate);
+        if let Some(body) = built.body {
             body_of_job[j] = out.bodies.len() as u32;
             out.bodies.push(body);
+            centers.push(built.center);
         }
     }
     instances.retain_mut(|i| {
         i.body = body_of_job[i.body as usize];
         i.body != EMPTY
     });
+    for instance in &mut instances {
+        let center = centers[instance.body as usize];
+        if center != DVec3::ZERO {
+            instance.world_from_mesh *= DAffine3::from_translation(center);
+        }
+    }
+    move_instances(&mut instances, placed, &out.key_times, &mut warnings)?;
     out.instances = instances;
+    out.drop_unplaced_bodies();
+    out.rest_without_motion();
     out.warnings = warnings.sentences();
     Ok(out)
+}
+
+impl Unique {
+    /// Bodies whose instances were all dropped.
+    fn drop_unplaced_bodies(&mut self) {
+        let mut is_placed = vec![false; self.bodies.len()];
+        for instance in &self.instances {
+            is_placed[instance.body as usize] = true;
+        }
+        if is_placed.iter().all(|&p| p) {
+            return;
+        }
+        let mut number = vec![0; is_placed.len()];
+        let mut next = 0;
+        for (number, &is_placed) in number.iter_mut().zip(&is_placed) {
+            *number = next;
+            next += u32::from(is_placed);
+        }
+        let mut keep = is_placed.into_iter();
+        self.bodies.retain(|_| keep.next().unwrap_or(true));
+        for instance in &mut self.instances {
+            instance.body = number[instance.body as usize];
+        }
+    }
+
+    /// One key frame where the key frames turned out to be equal.
+    fn rest_without_motion(&mut self) {
+        let moves = self.bodies.iter().any(|b| b.mesh.motion.is_some())
+            || self.instances.iter().any(|i| i.motion.is_some());
+        if !moves {
+            self.key_times.truncate(1);
+        }
+    }
+}
+
+/// What moves, for the choice of the key frames.
+fn movers(
+    jobs: &[Job],
+    read: &[Read],
+    read_of_job: &[usize],
+    instances: &[PlacedBody],
+    placed: &Placed,
+) -> Vec<Mover> {
+    // The boxes of what a node carries, and the instances of bodies that deform.
+    let mut boxes: BTreeMap<u32, Bounds> = BTreeMap::new();
+    let mut soft: BTreeMap<u32, (Option<u32>, Vec<DAffine3>)> = BTreeMap::new();
+    for instance in instances {
+        let carrier = placed.placements[instance.placement as usize].carrier;
+        match &read[read_of_job[instance.body as usize]].content {
+            Content::Body(Some(body)) => {
+                if let Some(carrier) = carrier {
+                    let bounds = body.mesh.bounds.transformed(&instance.world_from_mesh);
+                    let all = boxes.entry(carrier).or_insert(Bounds::EMPTY);
+                    *all = all.union(bounds);
+                }
+            }
+            Content::Body(None) => {}
+            Content::Soft { .. } => {
+                let flatten = jobs[instance.body as usize].key.flatten.map(linear_part);
+                let linear = flatten.unwrap_or(DMat3::IDENTITY);
+                let map = instance.world_from_mesh * DAffine3::from_mat3(linear);
+                let entry = soft.entry(instance.body).or_insert_with(|| (carrier, vec![]));
+                entry.1.push(map);
+            }
+        }
+    }
+    let rigid = boxes.into_iter().map(|(node, bounds)| Mover {
+        part: Part::Node(node),
+        base: corners_of(bounds).collect(),
+        terms: vec![],
+        weights: None,
+        stretch: 1.0,
+    });
+    let mut movers: Vec<Mover> = rigid.collect();
+    for (job, (carrier, maps)) in soft {
+        if let Content::Soft { soft, .. } = &read[read_of_job[job as usize]].content {
+            movers.extend(soft.movers(&placed.rig, carrier, &maps));
+        }
+    }
+    movers
+}
+
+/// Refuses scenes whose moving parts would take more memory than is allowed.
+fn check_moving(
+    read: &[Read],
+    instances: &[PlacedBody],
+    placed: &Placed,
+    keys: usize,
+    options: &OpenOptions,
+) -> Result<(), SceneError> {
+    /// A transform takes the bytes of eight positions.
+    const TRANSFORM: u64 = 8;
+    let moves = |i: &&PlacedBody| placed.placements[i.placement as usize].carrier.is_some();
+    let transforms = TRANSFORM * instances.iter().filter(moves).count() as u64;
+    let vertices = |read: &Read| match &read.content {
+        Content::Soft { soft, .. } => soft.positions.len() as u64,
+        Content::Body(_) => 0,
+    };
+    let positions: u64 = read.iter().map(vertices).sum();
+    let count = (transforms + positions).saturating_mul(keys as u64);
+    let limit = options.max_moving_positions;
+    if count > limit { Err(Cause::TooManyMovingPositions { count, limit }.into()) } else { Ok(()) }
+}
+
+/// Gives instances that are carried their transforms at the key frames; drops those whose triangles
+/// are lines or points at all of them.
+fn move_instances(
+    instances: &mut Vec<PlacedBody>,
+    placed: &Placed,
+    times: &[f64],
+    warnings: &mut Warnings,
+) -> Result<(), SceneError> {
+    // Instances of a placement follow each other.
+    let mut current = (u32::MAX, vec![]);
+    let mut failed = None;
+    instances.retain_mut(|instance| {
+        let Some(node) = placed.placements[instance.placement as usize].carrier else {
+            return true;
+        };
+        if current.0 != node {
+            let at = |&t: &f64| placed.rig.world_from_node(node, t);
+            current = (node, times.iter().map(at).collect::<Vec<_>>());
+        }
+        let maps: Box<[DAffine3]> =
+            current.1.iter().map(|world| *world * instance.world_from_mesh).collect();
+        if !maps.iter().all(|m: &DAffine3| m.is_finite()) {
+            failed.get_or_insert(node);
+            return true;
+        }
+        if maps.iter().all(|m| is_collapsed(&m.matrix3)) {
+            let sentence = "an instance that a scale of zero collapses throughout is left out";
+            warnings.add(sentence, || format!("node {node}"));
+            return false;
+        }
+        instance.world_from_mesh = maps[0];
+        let changes = maps.iter().any(|m| *m != maps[0]);
+        instance.motion = (changes || flattening(&maps[0]).is_some()).then_some(maps);
+        true
+    });
+    let not_finite = |n: u32| SceneError::from(Cause::TransformNotFinite).at_node(n as usize);
+    failed.map_or(Ok(()), |node| Err(not_finite(node)))
+}
+
+/// True for a map onto a line or a point.
+fn is_collapsed(m: &DMat3) -> bool {
+    let pairs = [(m.x_axis, m.y_axis), (m.y_axis, m.z_axis), (m.z_axis, m.x_axis)];
+    pairs.iter().all(|(a, b)| a.cross(*b) == DVec3::ZERO)
+}
+
+/// The file, and what moves it.
+struct Place<'a> {
+    document: &'a Document,
+    accessors: &'a Accessors<'a>,
+    placed: &'a Placed,
+    animations: &'a Animations,
+}
+
+/// What bodies that deform need.
+struct Deforming<'a> {
+    skins: HashMap<u32, Arc<Skin>>,
+    animations: &'a Animations,
 }
 
 /// What the placements need, before anything is read.
@@ -164,39 +404,55 @@ struct Survey {
     job_of_key: HashMap<Key, u32>,
     instances: Vec<PlacedBody>,
     /// Keys of primitives by mesh, for meshes without a node's own weights.
-    keys_of_mesh: HashMap<u32, Vec<Option<Key>>>,
+    keys_of_mesh: HashMap<u32, Vec<Option<(Key, Sets)>>>,
+    skins: HashMap<u32, Arc<Skin>>,
     skipped: SkippedPrimitives,
     flattened: u64,
     warnings: Warnings,
 }
 
 impl Survey {
-    fn placement(
-        &mut self,
-        document: &Document,
-        accessors: &Accessors,
-        placed: &Placed,
-        index: u32,
-    ) -> Result<(), SceneError> {
+    fn placement(&mut self, place: &Place, index: u32) -> Result<(), SceneError> {
+        let Place { document, accessors, placed, animations } = *place;
         let placement = &placed.placements[index as usize];
-        let mesh = placement.mesh;
+        let (mesh, node) = (placement.mesh, placement.node);
         if !self.keys_of_mesh.contains_key(&mesh) {
             let keys = self.keys(document, accessors, mesh)?;
             self.keys_of_mesh.insert(mesh, keys);
         }
         let mut keys = self.keys_of_mesh[&mesh].clone();
-        if let Some(weights) = &document.nodes[placement.node as usize].weights {
-            for (key, primitive) in keys.iter_mut().zip(&document.meshes[mesh as usize].primitives)
-            {
-                if let Some(key) = key {
-                    key.morph = morph(primitive, weights);
-                }
+        let tracks = animations.weights(node);
+        let held = tracks.map(|s| (0..s.width()).map(|k| s.number(k, 0.0) as f32).collect());
+        let changing = tracks.is_some_and(|s| !s.is_constant());
+        let own = held.as_ref().or(document.nodes[node as usize].weights.as_ref());
+        let primitives = &document.meshes[mesh as usize].primitives;
+        for (key, primitive) in keys.iter_mut().zip(primitives) {
+            let Some((key, sets)) = key else { continue };
+            if let Some(weights) = own {
+                key.morph = morph(primitive, weights);
             }
+            let targets = if changing { targets(primitive) } else { vec![] };
+            if !targets.is_empty() {
+                key.morph = vec![];
+            }
+            let skin = document.nodes[node as usize].skin.filter(|_| !sets.sets.is_empty());
+            if placement.skinned && skin.is_none() {
+                let sentence =
+                    "a primitive without joints is shown with a skin; it is read as it is";
+                self.warnings.add(sentence, || format!("node {node}, mesh {mesh}"));
+            }
+            if let Some(skin) = skin {
+                self.skin(place, skin)?;
+            }
+            let skin = skin.map(|skin| (skin, std::mem::take(sets)));
+            key.deform =
+                (skin.is_some() || !targets.is_empty()).then_some(Deform { node, skin, targets });
         }
+        let keys: Vec<Option<Key>> = keys.into_iter().map(|key| Some(key?.0)).collect();
         // One look-up a primitive, not one an instance; none where every instance is flattened.
         let mut jobs: Vec<Option<u32>> = vec![None; keys.len()];
         for (i, transform) in placement.transforms.iter().enumerate() {
-            let flatten = flattening(transform);
+            let flatten = placement.carrier.is_none().then(|| flattening(transform)).flatten();
             for (p, key) in keys.iter().enumerate() {
                 let Some(key) = key else { continue };
                 let (job, world_from_mesh) = match flatten {
@@ -219,9 +475,26 @@ impl Survey {
                     gpu_instance: placement.gpu_instanced.then_some(i as u32),
                     primitive: p as u32,
                     world_from_mesh,
+                    motion: None,
                 });
             }
         }
+        Ok(())
+    }
+
+    /// Reads a skin that is used, once.
+    fn skin(&mut self, place: &Place, number: u32) -> Result<(), SceneError> {
+        if self.skins.contains_key(&number) {
+            return Ok(());
+        }
+        let skin = Skin::read(place.document, place.accessors, number)?;
+        let outside = |&node: &u32| !place.placed.rig.has(node);
+        if let Some(joint) = skin.joints.iter().position(outside) {
+            let node = skin.joints[joint];
+            let cause = Cause::JointNotInScene { joint: joint as u64, node };
+            return Err(SceneError::from(cause).at_skin(number));
+        }
+        self.skins.insert(number, Arc::new(skin));
         Ok(())
     }
 
@@ -244,7 +517,7 @@ impl Survey {
         document: &Document,
         accessors: &Accessors,
         mesh: u32,
-    ) -> Result<Vec<Option<Key>>, SceneError> {
+    ) -> Result<Vec<Option<(Key, Sets)>>, SceneError> {
         let json = &document.meshes[mesh as usize];
         let mut keys = Vec::with_capacity(json.primitives.len());
         for (p, primitive) in json.primitives.iter().enumerate() {
@@ -253,7 +526,8 @@ impl Survey {
                 .map_err(|e| e.at_primitive(mesh as usize, p))?;
             let weights = json.weights.as_deref().unwrap_or(&[]);
             let morph = morph(primitive, weights);
-            keys.push(source.map(|source| Key { source, morph, flatten: None }));
+            let key = |(source, sets)| (Key { source, morph, flatten: None, deform: None }, sets);
+            keys.push(source.map(key));
         }
         Ok(keys)
     }
@@ -263,7 +537,7 @@ impl Survey {
         document: &Document,
         accessors: &Accessors,
         primitive: &json::mesh::Primitive,
-    ) -> Result<Option<Source>, SceneError> {
+    ) -> Result<Option<(Source, Sets)>, SceneError> {
         let topology = match primitive.mode {
             Checked::Invalid => {
                 return Err(Cause::InvalidValue { property: "`mode`".into() }.into());
@@ -304,11 +578,12 @@ impl Survey {
                     let reason = "its attributes have no POSITION".into();
                     return Err(Cause::ExtensionMalformed { extension: draco::NAME, reason }.into());
                 };
-                return Ok(Some(Source::Draco { view: draco.buffer_view, position }));
+                let source = Source::Draco { view: draco.buffer_view, position };
+                return Ok(Some((source, Sets::of_names(&draco.attributes))));
             }
         }
         let indices = primitive.indices.as_ref().map(|i| i.value() as u32);
-        Ok(Some(Source::Plain { positions, indices, topology }))
+        Ok(Some((Source::Plain { positions, indices, topology }, Sets::of(primitive))))
     }
 }
 
@@ -317,6 +592,12 @@ fn morph(primitive: &json::mesh::Primitive, weights: &[f32]) -> Vec<(u32, u32)> 
     let targets = primitive.targets.as_deref().unwrap_or(&[]);
     let moving = targets.iter().zip(weights).filter(|(_, w)| **w != 0.0);
     moving.filter_map(|(t, w)| Some((t.positions.as_ref()?.value() as u32, w.to_bits()))).collect()
+}
+
+/// Morph targets that can move vertices: their numbers and accessors.
+fn targets(primitive: &json::mesh::Primitive) -> Vec<(u32, u32)> {
+    let targets = primitive.targets.as_deref().unwrap_or(&[]).iter().enumerate();
+    targets.filter_map(|(k, t)| Some((k as u32, t.positions.as_ref()?.value() as u32))).collect()
 }
 
 /// The linear part of a transform that cannot be inverted, `None` for those that can.
@@ -374,23 +655,45 @@ fn check_size(
 
 /// What reading a job gives.
 struct Read {
-    body: Option<Body>,
+    content: Content,
     degenerate: Option<DegenerateTriangles>,
     odd_indices: bool,
 }
 
-fn read(job: &Job, accessors: &Accessors) -> Result<Read, SceneError> {
+/// Triangles, or what they are made of at the key frames.
+enum Content {
+    Body(Option<Body>),
+    Soft {
+        soft: Soft,
+        triangles: Vec<[u32; 3]>,
+        /// Numbers of the vertices in the primitive.
+        chosen: Vec<u32>,
+    },
+}
+
+fn linear_part(columns: [u64; 9]) -> DMat3 {
+    DMat3::from_cols_array(&columns.map(f64::from_bits))
+}
+
+fn read(job: &Job, accessors: &Accessors, deforming: &Deforming) -> Result<Read, SceneError> {
+    let deforms = job.key.deform.is_some();
     let mut chosen = None;
-    let (mut positions, corners) = match job.key.source {
+    let mut followed = vec![];
+    let (mut positions, mut corners) = match job.key.source {
         Source::Plain { positions, indices, topology } => {
             let elements = accessors.elements(positions, &POSITIONS)?;
             let mut corners = corners(accessors, indices, topology, elements.count)?;
-            chosen = choose_vertices(&mut corners.triangles, elements.count);
+            chosen = choose_vertices(&mut corners.triangles, elements.count, deforms);
             (elements.vectors_of::<3>(chosen.as_deref())?, corners)
         }
         Source::Draco { view, position } => {
             let view = accessors.view(view, || draco::NAME.into())?;
-            let Decoded { positions, triangles } = draco::decode(view.bytes, position)?;
+            let sets = job.key.deform.as_ref().and_then(|d| d.skin.as_ref()).map(|(_, s)| s);
+            let others: Vec<u32> =
+                sets.iter().flat_map(|s| &s.sets).flat_map(|&(j, w)| [j, w]).collect();
+            let Decoded { positions, triangles, others } =
+                draco::decode(view.bytes, position, &others)?;
+            followed = others;
             let vertices = positions.len();
             let outside = |&v: &u32| v as usize >= vertices;
             if let Some(at) = triangles.as_flattened().iter().position(outside) {
@@ -401,28 +704,110 @@ fn read(job: &Job, accessors: &Accessors) -> Result<Read, SceneError> {
             (positions, Corners { triangles, odd: false })
         }
     };
+    let vertices = positions.len();
     for &(accessor, weight) in &job.key.morph {
         displace(accessors, &mut positions, chosen.as_deref(), accessor, f32::from_bits(weight))?;
     }
-    if let Some(columns) = job.key.flatten {
-        let linear = DMat3::from_cols_array(&columns.map(f64::from_bits));
+    let odd_indices = corners.odd;
+    if let Some(deform) = &job.key.deform {
+        let used = match chosen {
+            Some(chosen) => chosen,
+            // Decoded data has no choice of vertices.
+            None => {
+                let used = choose_vertices(&mut corners.triangles, vertices, true);
+                let used = used.unwrap_or_default();
+                positions = used.iter().map(|&v| positions[v as usize]).collect();
+                used
+            }
+        };
+        let soft =
+            soften(deform, job.key.source, accessors, deforming, positions, &used, &followed)?;
+        let content = Content::Soft { soft, triangles: corners.triangles, chosen: used };
+        return Ok(Read { content, degenerate: None, odd_indices });
+    }
+    if let Some(linear) = job.key.flatten.map(linear_part) {
         for p in &mut positions {
             let q = linear * DVec3::from_array(p.map(f64::from));
             *p = q.to_array().map(|v| v as f32);
         }
     }
-    let odd_indices = corners.odd;
     check_positions(&positions, chosen.as_deref(), &corners.triangles)?;
-    let (body, degenerate) = body(job, positions, corners.triangles);
-    Ok(Read { body, degenerate, odd_indices })
+    let (body, degenerate) = body(job, vec![positions], corners.triangles);
+    Ok(Read { content: Content::Body(body), degenerate, odd_indices })
+}
+
+/// Reads what moves the vertices of a body. `used` are the numbers of its vertices.
+fn soften(
+    deform: &Deform,
+    source: Source,
+    accessors: &Accessors,
+    deforming: &Deforming,
+    positions: Vec<[f32; 3]>,
+    used: &[u32],
+    followed: &[Vec<[f32; 4]>],
+) -> Result<Soft, SceneError> {
+    let mut targets = Vec::with_capacity(deform.targets.len());
+    for &(number, accessor) in &deform.targets {
+        let by = displacements(accessors, Some(used), used.len(), accessor)?;
+        let moved = (0u32..).zip(by).filter(|(_, by)| *by != [0.0; 3]);
+        targets.push((number as usize, moved.collect()));
+    }
+    let skin = match &deform.skin {
+        None => None,
+        Some((number, sets)) => {
+            let skin = deforming.skins[number].clone();
+            let joints = skin.joints.len();
+            let influences = match source {
+                Source::Plain { positions, .. } => {
+                    let vertices = accessors.elements(positions, &POSITIONS)?.count;
+                    Influences::read(accessors, sets, used, vertices, joints)?
+                }
+                Source::Draco { .. } => Influences::of_columns(followed, used, joints)?,
+            };
+            Some((skin, influences))
+        }
+    };
+    let weights =
+        if targets.is_empty() { None } else { deforming.animations.weights(deform.node).cloned() };
+    Ok(Soft { positions, targets, weights, skin })
+}
+
+/// What building a job gives.
+struct Built {
+    body: Option<Body>,
+    /// Mesh space from the space of the stored positions is a translation by it.
+    center: DVec3,
+    degenerate: Option<DegenerateTriangles>,
+    odd_indices: bool,
+}
+
+/// Puts the vertices of bodies that deform where they are at the key frames.
+fn build(job: &Job, read: Read, rig: &Rig, times: &[f64]) -> Result<Built, SceneError> {
+    let Read { content, degenerate, odd_indices } = read;
+    let (soft, triangles, chosen) = match content {
+        Content::Body(body) => {
+            return Ok(Built { body, center: DVec3::ZERO, degenerate, odd_indices });
+        }
+        Content::Soft { soft, triangles, chosen } => (soft, triangles, chosen),
+    };
+    let after = job.key.flatten.map(linear_part);
+    // A flattened body has another space.
+    let center = if after.is_some() { DVec3::ZERO } else { soft.center(rig, times) };
+    let keys = soft.keys(rig, times, center, after);
+    drop(soft);
+    for positions in &keys {
+        check_positions(positions, Some(&chosen), &triangles)?;
+    }
+    let (body, degenerate) = body(job, keys, triangles);
+    Ok(Built { body, center, degenerate, odd_indices })
 }
 
 /// For a primitive that uses few of its vertices: those that it uses, ascending; renumbers the
 /// triangles. Files exist in which thousands of primitives share one array of all vertices of the
-/// scene, which must not be read once a primitive.
-fn choose_vertices(triangles: &mut [[u32; 3]], vertices: usize) -> Option<Vec<u32>> {
+/// scene, which must not be read once a primitive. With `always`, for any primitive.
+fn choose_vertices(triangles: &mut [[u32; 3]], vertices: usize, always: bool) -> Option<Vec<u32>> {
     let corners = triangles.as_flattened_mut();
-    if corners.len() >= vertices / 4 {
+    if !always && corners.len() >= vertices / 4 {
         return None;
     }
     let mut chosen = corners.to_vec();
@@ -500,8 +885,24 @@ fn displace(
     accessor: u32,
     weight: f32,
 ) -> Result<(), SceneError> {
+    let by = displacements(accessors, chosen, positions.len(), accessor)?;
+    for (p, d) in positions.iter_mut().zip(by) {
+        for k in 0..3 {
+            p[k] = (f64::from(p[k]) + f64::from(weight) * f64::from(d[k])) as f32;
+        }
+    }
+    Ok(())
+}
+
+/// How far a morph target moves some vertices, or all of `vertices`.
+fn displacements(
+    accessors: &Accessors,
+    chosen: Option<&[u32]>,
+    vertices: usize,
+    accessor: u32,
+) -> Result<Vec<[f32; 3]>, SceneError> {
     let elements = accessors.elements(accessor, &POSITIONS)?;
-    let expected = chosen.map_or(positions.len(), |c| c.last().map_or(0, |&v| v as usize + 1));
+    let expected = chosen.map_or(vertices, |c| c.last().map_or(0, |&v| v as usize + 1));
     let enough = match chosen {
         None => elements.count == expected,
         Some(_) => elements.count >= expected,
@@ -511,12 +912,7 @@ fn displace(
         let use_as = "POSITION of a morph target";
         return Err(Cause::CountMismatch { accessor, use_as, count, expected }.into());
     }
-    for (p, d) in positions.iter_mut().zip(elements.vectors_of::<3>(chosen)?) {
-        for k in 0..3 {
-            p[k] = (f64::from(p[k]) + f64::from(weight) * f64::from(d[k])) as f32;
-        }
-    }
-    Ok(())
+    elements.vectors_of::<3>(chosen)
 }
 
 /// Refuses triangles whose corners are not finite or absurdly far away.
@@ -537,10 +933,11 @@ fn check_positions(
     })
 }
 
-/// Drops degenerate triangles, builds the hierarchy, and renumbers vertices by first use.
+/// Drops triangles that are degenerate at all key frames, builds the hierarchy, and renumbers vertices
+/// by first use. `keys` are the positions at each key frame, or one for all.
 fn body(
     job: &Job,
-    positions: Vec<[f32; 3]>,
+    keys: Vec<Vec<[f32; 3]>>,
     mut triangles: Vec<[u32; 3]>,
 ) -> (Option<Body>, Option<DegenerateTriangles>) {
     let (mesh, primitive) = (job.mesh, job.primitive);
@@ -548,7 +945,7 @@ fn body(
     let mut kept: Vec<u32> = Vec::with_capacity(triangles.len());
     let mut number = 0;
     triangles.retain(|t| {
-        let degenerate = is_degenerate(t.map(|v| positions[v as usize]));
+        let degenerate = keys.iter().all(|key| is_degenerate(t.map(|v| key[v as usize])));
         if !degenerate {
             kept.push(number);
         } else {
@@ -561,7 +958,7 @@ fn body(
         !degenerate
     });
     let body = (!triangles.is_empty()).then(|| {
-        let (mut out, order) = Mesh::new(positions, &triangles);
+        let (mut out, order) = Mesh::moving(keys, &triangles);
         renumber_vertices(&mut out);
         let triangles = order.iter().map(|&t| kept[t as usize]).collect();
         Body { mesh: out, source: MeshSource { mesh, primitive, triangles } }
@@ -573,15 +970,19 @@ fn body(
 fn renumber_vertices(mesh: &mut Mesh) {
     const UNUSED: u32 = u32::MAX;
     let mut new_number = vec![UNUSED; mesh.positions.len()];
-    let mut positions = Vec::new();
+    let mut used = Vec::new();
     for v in mesh.triangles.as_flattened_mut() {
         let number = &mut new_number[*v as usize];
         if *number == UNUSED {
-            *number = positions.len() as u32;
-            positions.push(mesh.positions[*v as usize]);
+            *number = used.len() as u32;
+            used.push(*v);
         }
         *v = *number;
     }
-    positions.shrink_to_fit();
-    mesh.positions = positions;
+    drop(new_number);
+    let choose = |positions: &mut Vec<[f32; 3]>| {
+        *positions = used.iter().map(|&v| positions[v as usize]).collect();
+    };
+    choose(&mut mesh.positions);
+    mesh.motion.iter_mut().flat_map(|m| &mut m.keys).for_each(choose);
 }

@@ -203,7 +203,7 @@ impl TileSolver {
                 Of::Particles(number) => Some(&geometry.particles[number as usize].hierarchy),
                 Of::Instance(id) => self.mesh(context, id).motion.as_ref().map(|m| &m.hierarchy),
             };
-            if self.is_hidden(&entry) {
+            if self.is_hidden_in_rows(&entry) {
                 if let Some(hierarchy) = hierarchy {
                     self.try_volume(walk, entry.space, entry.node, hierarchy);
                 }
@@ -312,8 +312,9 @@ impl TileSolver {
             return None;
         }
         let boxes = hierarchy.around(node, walk.state)?;
-        let seen =
-            self.entry_in_beam(walk, space, node, boxes).filter(|entry| !self.is_hidden(entry));
+        let seen = self
+            .entry_in_beam(walk, space, node, boxes)
+            .filter(|entry| !self.is_hidden_in_rows(entry));
         if seen.is_none() {
             self.try_volume(walk, space, node, hierarchy);
         }
@@ -323,7 +324,8 @@ impl TileSolver {
     /// The entry of a node of a mesh that does not change.
     fn seen_rigid(&mut self, walk: &Walk, space: u32, node: u32, mesh: &Mesh) -> Option<Entry> {
         let own = &mesh.hierarchy.nodes.get(node as usize)?.bounds;
-        self.entry_in_beam(walk, space, node, (own, own)).filter(|entry| !self.is_hidden(entry))
+        self.entry_in_beam(walk, space, node, (own, own))
+            .filter(|entry| !self.is_hidden_in_rows(entry))
     }
 
     /// The entry of a node with these boxes at the two key frames; `None` outside of the beam.
@@ -391,17 +393,31 @@ impl TileSolver {
         if near > far + slack {
             return None;
         }
+        let mut rows = 0..self.rows.len();
         if near > 0.0 {
             let (lo, hi) = (y.0 - slack, y.1 + slack);
             let (a, b) = (1.0 / near, 1.0 / (far + slack));
             let lo = if lo < 0.0 { lo * a } else { lo * b };
             let hi = if hi < 0.0 { hi * b } else { hi * a };
-            if rows_met(&self.rows, (lo, hi)).is_empty() {
+            rows = rows_met(&self.rows, (lo, hi));
+            if rows.is_empty() {
                 return None;
             }
         }
         let (first_bin, last_bin) = (bin_of(start) as u8, bin_of(end) as u8);
-        Some(Entry { near, corner, first_bin, last_bin, space: 0, node: 0 })
+        let (first_row, end_row) = (rows.start as u8, rows.end as u8);
+        Some(Entry { near, corner, first_bin, last_bin, first_row, end_row, space: 0, node: 0 })
+    }
+
+    /// True when an entry is hidden in all pixels of the rows that it can be seen in: what is far away
+    /// is seen in few rows, and the sky above it hides nothing.
+    #[inline(always)]
+    fn is_hidden_in_rows(&mut self, entry: &Entry) -> bool {
+        if self.is_hidden(entry) {
+            return true;
+        }
+        let rows = entry.first_row as usize..entry.end_row as usize;
+        rows.len() < self.rows.len() && self.row_far[rows].iter().all(|far| entry.is_behind(far))
     }
 
     /// The key of a node's volumes, and how many things they are of; `None` for what has none.
@@ -463,9 +479,12 @@ impl TileSolver {
         self.counters.volumes += 1;
         let swept = hierarchy.swept(node, next..next + window);
         let hidden = swept.is_empty()
-            || self
-                .entry_in_beam(walk, space, node, (&swept, &swept))
-                .is_none_or(|e| self.moving.base_tile.hides(e.near, e.first_bin, e.last_bin));
+            || self.entry_in_beam(walk, space, node, (&swept, &swept)).is_none_or(|e| {
+                let rows = e.first_row as usize..e.end_row as usize;
+                let base = &self.moving;
+                e.is_behind(&base.base_tile)
+                    || base.base_rows[rows].iter().all(|far| e.is_behind(far))
+            });
         if hidden {
             volume = Volume { expires: next + window, window, retry: next, gap: 1 };
         } else {
@@ -534,7 +553,7 @@ impl TileSolver {
             let first = (a.first[lane] - slack_hi, b.first[lane] - slack_hi);
             let last = (a.last[lane] + slack_lo, b.last[lane] + slack_lo);
             let Some(entry) = self.entry_within(context, (x, y, z), first, last) else { continue };
-            if self.is_hidden(&entry) {
+            if self.is_hidden_in_rows(&entry) {
                 continue;
             }
             let length = context.frame.length;
@@ -600,14 +619,15 @@ impl TileSolver {
             let first = (least_of(0), least_of(1));
             let last = (largest_of(0), largest_of(1));
             let Some(entry) = self.entry_within(context, (x, y, z), first, last) else { continue };
-            if self.is_hidden(&entry) {
+            if self.is_hidden_in_rows(&entry) {
                 continue;
             }
             let sphere = MovingSphere::new(center, radius, context.frame.length);
             let primitive = system.first_primitive.0 + particle as u32;
-            for row in 0..self.rows.len() {
+            for row in entry.first_row as usize..entry.end_row as usize {
                 let w = self.rows[row];
-                if !sphere.meets_row(w, bounds) {
+                self.refresh_row(row);
+                if entry.is_behind(&self.row_far[row]) || !sphere.meets_row(w, bounds) {
                     continue;
                 }
                 self.counters.cuts += 1;

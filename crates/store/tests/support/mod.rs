@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 use serde_json::json;
 use sightline_geometry::{
-    Bounds, CellId, MeshId, ObjectId, PrimitiveSet, Run, SegmentId, ViewCell,
+    Bounds, CellId, MeshId, ObjectId, PrimitiveSet, Run, SegmentId, Timeline, ViewCell,
 };
 use sightline_store::{
     BakeStore, CellEffort, CellRow, DatasetWriter, Description, Limits, Manifest, NumberedInstance,
@@ -36,25 +36,79 @@ impl Sequence {
 pub struct Sample {
     pub objects: Vec<SceneObject>,
     pub numbering: Numbering,
+    pub timeline: Timeline,
+    /// Of each cell the row of all states, and what it sees of each object.
     pub cells: Vec<(CellRow, Vec<ObjectRow>)>,
+    /// Of each cell the rows of its runs, by time; none where there is one run.
+    pub runs: Vec<Vec<CellRow>>,
     pub description: Description,
 }
+
+/// The states of the runs of a cell that has several.
+const RUNS: [std::ops::Range<u32>; 3] = [0..2, 2..3, 3..5];
 
 const MESH_SIZES: [u32; 3] = [12, 40, 250];
 const NAMES: [&str; 4] = ["house", "tree", "fence", "lamp \u{2014} small"];
 
 impl Sample {
-    /// `cells` cells that see a scene of `object_count` objects.
+    /// `cells` cells that see a scene of `object_count` objects at rest.
     pub fn new(cells: u32, object_count: u32) -> Self {
         let mut random = Sequence::new(7);
         let (objects, numbering) = scene(object_count, &mut random);
-        let cells = (0..cells).map(|id| cell(id, &objects, &mut random)).collect();
-        Self { objects, numbering, cells, description: description() }
+        let cells: Vec<_> = (0..cells).map(|id| cell(id, &objects, &mut random)).collect();
+        let runs = vec![Vec::new(); cells.len()];
+        let timeline = Timeline::at_rest();
+        Self { objects, numbering, timeline, cells, runs, description: description() }
+    }
+
+    /// The same in a scene of five states, where every third cell sees something else in the first two,
+    /// the third and the last two. The last object is a particle system.
+    pub fn moving(cells: u32, object_count: u32) -> Self {
+        let mut sample = Self::new(cells, object_count);
+        sample.timeline = Timeline::new(vec![0.0, 0.5, 1.0, 2.0, 4.0, 4.25]).unwrap();
+        let last = sample.objects[sample.objects.len() - 1].clone();
+        sample.numbering.instances.retain(|instance| instance.object != last.id);
+        let scene = &mut sample.description.scene;
+        scene.particle_systems = 1;
+        scene.particles = u64::from(last.end_primitive - last.first_primitive);
+        for ((union, pairs), runs) in sample.cells.iter_mut().zip(&mut sample.runs) {
+            union.last_state = 4;
+            if union.cell.id.0.is_multiple_of(3) {
+                *runs = RUNS.iter().zip(0..).map(|(states, k)| part(union, states, k)).collect();
+            }
+            for pair in pairs {
+                let object = &sample.objects[pair.object.index()];
+                let own = object.first_primitive..object.end_primitive;
+                let seen = |run: &&CellRow| run.set.count_in(own.clone()) > 0;
+                let runs = if runs.is_empty() { std::slice::from_ref(union) } else { &runs[..] };
+                pair.first_state = runs.iter().find(seen).unwrap().first_state;
+                pair.last_state = runs.iter().rev().find(seen).unwrap().last_state;
+            }
+        }
+        sample
     }
 
     /// The sample of the golden files.
     pub fn golden() -> Self {
+        Self::moving(24, 60)
+    }
+
+    /// The sample of the golden files of versions 1 and 2.
+    pub fn golden_at_rest() -> Self {
         Self::new(24, 60)
+    }
+
+    /// The rows of cell `k`, as the table has them: all states, then the longest runs first.
+    pub fn rows(&self, k: usize) -> Vec<CellRow> {
+        let mut runs = self.runs[k].clone();
+        runs.sort_by_key(|run| std::cmp::Reverse(run.last_state - run.first_state));
+        runs.insert(0, self.cells[k].0.clone());
+        runs
+    }
+
+    /// The rows of all cells.
+    pub fn all_rows(&self) -> Vec<CellRow> {
+        (0..self.cells.len()).flat_map(|k| self.rows(k)).collect()
     }
 
     /// Stores all files; gives the manifest.
@@ -67,9 +121,10 @@ impl Sample {
         store: &BakeStore,
         limits: Limits,
     ) -> sightline_store::Result<Manifest> {
-        let mut writer = DatasetWriter::with_limits(store, self.objects.clone(), limits)?;
-        for (cell, pairs) in &self.cells {
-            writer.push_cell(cell, pairs).await?;
+        let (objects, timeline) = (self.objects.clone(), self.timeline.clone());
+        let mut writer = DatasetWriter::with_limits(store, objects, timeline, limits)?;
+        for (k, (_, pairs)) in self.cells.iter().enumerate() {
+            writer.push_cell(&self.rows(k), pairs).await?;
         }
         writer.finish(&self.numbering, self.description.clone()).await
     }
@@ -167,11 +222,27 @@ fn cell(id: u32, objects: &[SceneObject], random: &mut Sequence) -> (CellRow, Ve
             height: 0.25,
         },
         tile,
+        first_state: 0,
+        last_state: 0,
         set,
         weights,
         effort,
     };
     (row, pairs)
+}
+
+/// What a run of states sees of a cell's set: two members of three, others in each run.
+fn part(union: &CellRow, states: &std::ops::Range<u32>, run: u32) -> CellRow {
+    let seen =
+        union.set.iter().zip(&union.weights).filter(|(p, _)| !(p.0 / 7 + run).is_multiple_of(3));
+    let (members, weights): (Vec<u32>, Vec<Weight>) = seen.map(|(p, w)| (p.0, *w)).unzip();
+    CellRow {
+        first_state: states.start,
+        last_state: states.end - 1,
+        set: PrimitiveSet::from_sorted(members),
+        weights,
+        ..union.clone()
+    }
 }
 
 /// The weight of an object, shared out unevenly among its visible primitives.
@@ -201,7 +272,7 @@ fn description() -> Description {
     }
 }
 
-/// Rows of a made-up segments task.
+/// Rows of a made-up segments task; every fourth segment has two runs of states.
 pub fn segments(count: u32) -> Vec<SegmentRow> {
     let mut random = Sequence::new(11);
     let row = |id: u32| {
@@ -213,7 +284,18 @@ pub fn segments(count: u32) -> Vec<SegmentRow> {
             first = end + 1 + random.below(100);
         }
         let weights = (0..set.len()).map(|_| random.below(1 << 20) as f32 / 1e9).collect();
-        SegmentRow { segment: SegmentId(3 * id), set, weights, rays: u64::from(1000 + id) }
+        let (segment, rays) = (SegmentId(3 * id), u64::from(1000 + id));
+        let whole = SegmentRow { segment, first_state: 0, last_state: 4, set, weights, rays };
+        if !id.is_multiple_of(4) {
+            return vec![whole];
+        }
+        let nothing = SegmentRow {
+            first_state: 2,
+            set: PrimitiveSet::default(),
+            weights: vec![],
+            ..whole.clone()
+        };
+        vec![SegmentRow { last_state: 1, ..whole }, nothing]
     };
-    (0..count).map(row).collect()
+    (0..count).flat_map(row).collect()
 }
