@@ -231,7 +231,7 @@ fn scene() -> impl Strategy<Value = InstancedGeometry> {
 /// The same cases each time: a change is judged by what it changes.
 fn short_form() -> ProptestConfig {
     let rng_seed = proptest::test_runner::RngSeed::Fixed(20_261_122);
-    ProptestConfig { cases: 24, rng_seed, ..ProptestConfig::default() }
+    ProptestConfig { cases: 16, rng_seed, ..ProptestConfig::default() }
 }
 
 proptest! {
