@@ -323,12 +323,12 @@ impl<'a> MovingRow<'a> {
         for border in borders.into_iter().chain([(1.0, 0.0)]) {
             let (to, to_error) = if border.0 < 1.0 { border } else { (1.0, 0.0) };
             if to > from {
-                let middle = 0.5 * (from + to);
                 let mut ends = [0u8; 2];
                 let mut count = 0;
                 for k in 0..3 {
                     for &(s, e, end) in &stretches[k][..counts[k]] {
-                        if s < middle && middle < e && count < 2 {
+                        // All are turns: even where no number lies between them, one holds the other.
+                        if s <= from && to <= e && count < 2 {
                             ends[count] = end;
                             count += 1;
                         }

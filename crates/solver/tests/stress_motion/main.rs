@@ -85,7 +85,8 @@ agree_with_exact_arithmetic! {
 /// uncertain as where it is farthest, and so was where it is in front; and one whose plane touches the camera
 /// in the middle of an interval, or that is flat for an instant there, was not seen at all; of equal triangles
 /// that begin with other corners one with a higher number was seen, as their depths were rounded apart; and
-/// with a corner of two long sides to begin with, slivers were off by more than they need.
+/// with a corner of two long sides to begin with, slivers were off by more than they need; and two spheres
+/// changed places where their polynomial's noise did, not where their depths do.
 #[test]
 fn formerly_failing_cases_are_explained() {
     let cases = [
@@ -103,6 +104,10 @@ fn formerly_failing_cases_are_explained() {
         ("twice", 355),
         ("sliver", 399),
         ("sliver", 1263),
+        ("ball-lattice", 288),
+        ("ball-lattice", 547),
+        ("ball-lattice", 715),
+        ("ball-graze", 53),
     ];
     for (name, seed) in cases {
         let family = FAMILIES.iter().chain(BALLS).find(|f| f.name == name).expect("there is one");
@@ -137,6 +142,15 @@ fn a_moving_closed_mesh_around_the_camera_has_no_gap() {
 #[test]
 fn what_a_moving_closed_mesh_holds_is_not_found() {
     assert_no_leak("front");
+}
+
+/// Formerly leaking: a corner that passes a row plane one rounding before the end of the state, after which
+/// no edge was found to be cut.
+#[test]
+fn formerly_leaking_meshes_have_no_gap() {
+    let family = SHELLS.iter().find(|f| f.name == "around-carried").expect("there is one");
+    let tally = run_closed(family, 34);
+    assert!(tally.unexplained.is_empty(), "{}", tally.unexplained.join("\n"));
 }
 
 #[test]
