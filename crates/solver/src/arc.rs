@@ -374,8 +374,9 @@ struct Runs {
 }
 
 impl Runs {
-    /// Looks at `t`, later than before. `border` is where the sign changes if that is between: elsewhere
-    /// the change is looked for by halving.
+    /// Looks at `t`, later than before. `border` is where the sign should change if that is between: if one
+    /// of the two is nearer there for certain, the polynomial's noise has hidden the place, and it is looked
+    /// for by halving.
     fn push(&mut self, t: f64, border: f64, sign_at: &impl Fn(f64) -> i32) {
         let sign = sign_at(t);
         if sign == 0 || t <= self.seen {
@@ -384,18 +385,16 @@ impl Runs {
         if self.last == 0 {
             self.first = sign;
         } else if self.last != sign && self.count < Order::MOST {
-            let mut change = border;
-            if self.seen >= border {
-                let (mut before, mut behind) = (self.seen, t);
-                // Stops where neither is certain, or at a rounding.
-                for _ in 0..60 {
-                    change = 0.5 * (before + behind);
-                    match sign_at(change) {
-                        0 => break,
-                        s if s == sign => behind = change,
-                        _ => before = change,
-                    }
+            let (mut before, mut behind) = (self.seen, t);
+            let mut change = if before < border { border } else { 0.5 * (before + behind) };
+            // Stops where neither is certain, or at a rounding.
+            for _ in 0..60 {
+                match sign_at(change) {
+                    0 => break,
+                    s if s == sign => behind = change,
+                    _ => before = change,
                 }
+                change = 0.5 * (before + behind);
             }
             self.changes[self.count] = change;
             self.count += 1;

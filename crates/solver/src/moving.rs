@@ -31,6 +31,12 @@
 //! *Shared edges agree to the bit*: corners in canonical order, on a stretch that depends on the two
 //! corners alone. Closed meshes do not leak.
 //!
+//! *Equal triangles agree to the bit*, whichever corner they begin with and whichever way they turn: all
+//! is computed from the corners in canonical order. So what is in front of one is in front of all of them,
+//! and the tie rule alone decides between them. Were their depths rounded apart, a third triangle that is
+//! side by side with them would pass each at a time of its own, and between those times one that the tie
+//! rule hides would be seen.
+//!
 //! *Depth* is N / D: see [`crate::arc`]. N = 0 is the camera in the triangle's plane, for all rays at
 //! the same t; an interval that crosses it ends there, as only what is in front is seen.
 //!
@@ -90,10 +96,8 @@ impl<T: Copy + Default, const N: usize> Few<T, N> {
 /// A triangle whose corners move, relative to the camera.
 #[derive(Clone, Debug)]
 pub struct MovingTriangle {
-    /// Corners at t = 0 and at t = 1.
+    /// Corners at t = 0 and at t = 1, in canonical order.
     corners: [[DVec3; 3]; 2],
-    /// Which of two corners comes first in canonical order: (0, 1), (1, 2), (2, 0).
-    swapped: [bool; 3],
     /// Bernstein coefficients of the normal.
     normal: [DVec3; 3],
     /// ... of N.
@@ -111,26 +115,31 @@ impl MovingTriangle {
     #[inline]
     #[must_use]
     pub fn new(start: [DVec3; 3], end: [DVec3; 3], length: f64) -> Self {
+        let [start, end] = canonical(start, end);
+        // Largest length of the side opposite to each corner.
+        let opposite = [0, 1, 2].map(|k| {
+            let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+            (start[j] - start[i]).abs().max((end[j] - end[i]).abs()).length()
+        });
+        // The corner of the two shortest sides: a sliver's normal cancels least there.
+        let most = largest(largest(opposite[0], opposite[1]), opposite[2]);
+        let base = if opposite[0] == most { 0 } else { 1 + usize::from(opposite[1] != most) };
+        let (i, j) = ((base + 1) % 3, (base + 2) % 3);
         // Edges first: the camera's motion is the same for all corners and would round them.
-        let edges = |p: &[DVec3; 3]| (p[1] - p[0], p[2] - p[0]);
+        let edges = |p: &[DVec3; 3]| (p[i] - p[base], p[j] - p[base]);
         let ((e0, f0), (e1, f1)) = (edges(&start), edges(&end));
         let normal = [e0.cross(f0), 0.5 * (e0.cross(f1) + e1.cross(f0)), e1.cross(f1)];
         let relative = |p: DVec3| DVec3::new(p.x - length, p.y, p.z);
         let end = end.map(relative);
-        let (q0, q1) = (start[0], end[0]);
+        let (q0, q1) = (start[base], end[base]);
         let n = [
             normal[0].dot(q0),
             (normal[0].dot(q1) + 2.0 * normal[1].dot(q0)) / 3.0,
             (2.0 * normal[1].dot(q1) + normal[2].dot(q0)) / 3.0,
             normal[2].dot(q1),
         ];
-        let canonical = |p: usize| {
-            let of = |i: usize| (start[i].to_array(), end[i].to_array());
-            of(p) > of((p + 1) % 3)
-        };
-        let (e, f) = (e0.abs().max(e1.abs()), f0.abs().max(f1.abs()));
         // Products of the largest components bound every term of the normal and of N.
-        let normal_size = 2.0 * e.length() * f.length();
+        let normal_size = 2.0 * opposite[i] * opposite[j];
         let reach = q0.abs().max(q1.abs()).length();
         let mut z = (f64::INFINITY, f64::NEG_INFINITY);
         for p in start.iter().chain(&end) {
@@ -138,7 +147,6 @@ impl MovingTriangle {
         }
         Self {
             corners: [start, end],
-            swapped: [canonical(0), canonical(1), canonical(2)],
             normal,
             n,
             n_error: gamma(16) * normal_size * reach,
@@ -152,6 +160,20 @@ impl MovingTriangle {
     pub const fn depths(&self) -> (f64, f64) {
         self.z
     }
+}
+
+/// The corners of a triangle at t = 0 and at t = 1, in lexicographic order: that of the first place, then
+/// of the last.
+#[inline(always)]
+fn canonical(start: [DVec3; 3], end: [DVec3; 3]) -> [[DVec3; 3]; 2] {
+    let mut corners = [(start[0], end[0]), (start[1], end[1]), (start[2], end[2])];
+    for (i, j) in [(0, 1), (1, 2), (0, 1)] {
+        let of = |k: usize| (corners[k].0.to_array(), corners[k].1.to_array());
+        if of(i) > of(j) {
+            corners.swap(i, j);
+        }
+    }
+    [corners.map(|c| c.0), corners.map(|c| c.1)]
 }
 
 /// An edge's cut with a row, while it is cut.
@@ -269,8 +291,8 @@ impl<'a> MovingRow<'a> {
         let mut stretches = [[(0.0, 0.0, 0u8); 2]; 3];
         let mut counts = [0; 3];
         for k in 0..3 {
-            let (i, j) = (k, (k + 1) % 3);
-            let (p, q) = if triangle.swapped[k] { (j, i) } else { (i, j) };
+            // From the first to the second in canonical order.
+            let (p, q) = [(0, 1), (1, 2), (0, 2)][k];
             let (first, second) = (least(turns[p].0, turns[q].0), largest(turns[p].0, turns[q].0));
             let mut apart = a0[p] != a0[q];
             let mut from = 0.0;
@@ -301,12 +323,12 @@ impl<'a> MovingRow<'a> {
         for border in borders.into_iter().chain([(1.0, 0.0)]) {
             let (to, to_error) = if border.0 < 1.0 { border } else { (1.0, 0.0) };
             if to > from {
-                let middle = 0.5 * (from + to);
                 let mut ends = [0u8; 2];
                 let mut count = 0;
                 for k in 0..3 {
                     for &(s, e, end) in &stretches[k][..counts[k]] {
-                        if s < middle && middle < e && count < 2 {
+                        // All are turns: even where no number lies between them, one holds the other.
+                        if s <= from && to <= e && count < 2 {
                             ends[count] = end;
                             count += 1;
                         }
@@ -711,6 +733,36 @@ impl MovingSphere {
             if from < to && in_front {
                 let arc = Arc { time_error: whole.error, ..arc(inside) };
                 covered(Covered { start: from, end: to, ..whole }, arc);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn corner() -> impl Strategy<Value = (DVec3, DVec3)> {
+        let place = || (-9.0..9.0, -9.0..9.0, -1.0..9.0).prop_map(DVec3::from);
+        (place(), place())
+    }
+
+    /// Bits of all that is known of a triangle.
+    fn bits(corners: &[(DVec3, DVec3)], order: [usize; 3]) -> Vec<u64> {
+        let of = |end: fn(&(DVec3, DVec3)) -> DVec3| order.map(|k| end(&corners[k]));
+        let t = MovingTriangle::new(of(|c| c.0), of(|c| c.1), 1.5);
+        let vectors = t.corners.iter().flatten().chain(&t.normal).flat_map(|v| v.to_array());
+        let rest = t.n.into_iter().chain([t.n_error, t.normal_size, t.z.0, t.z.1]);
+        vectors.chain(rest).map(f64::to_bits).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn equal_triangles_are_equal_to_the_bit(corners in prop::collection::vec(corner(), 3)) {
+            let first = bits(&corners, [0, 1, 2]);
+            for order in [[1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]] {
+                prop_assert_eq!(&first, &bits(&corners, order));
             }
         }
     }

@@ -1,14 +1,18 @@
 //! The solver on what moves, against a picture: many times along each ray, each primitive where it is.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::{DAffine3, DQuat, DVec3};
 use proptest::prelude::*;
+use rayon::prelude::*;
 use sightline_geometry::{
     FACE_COUNT, Instance, InstancedGeometry, Mesh, MeshId, Moment, ObjectId, ParticleSystem,
     PrimitiveId, Ray, RectifiedFrame, Sampling, SegmentId, Sphere, ViewSegment, raycast::RayCaster,
 };
-use sightline_solver::{SolveOptions, StateVisibility, TimePath, solve_states};
+use sightline_solver::{
+    Pixel, SolveOptions, StateVisibility, TimePath, envelope::Interval, solve_states,
+    visit_intervals,
+};
 
 /// Times along a ray.
 const TIMES: u32 = 1500;
@@ -17,47 +21,86 @@ fn segment(v0: DVec3, v1: DVec3) -> ViewSegment {
     ViewSegment { id: SegmentId(0), v0, v1 }
 }
 
-/// The share of (directions x segment) on which each primitive is the nearest occluder, sampled in time,
-/// and the share of the directions in which it is at any time: a step of time in each of these is what
-/// an end of an interval may be off by.
+/// The place of a pixel in the order of faces, rows and columns.
+fn number(sampling: Sampling, pixel: Pixel) -> usize {
+    (pixel.face * sampling.rows() as usize + pixel.row as usize) * sampling.columns() as usize
+        + pixel.column as usize
+}
+
+/// Of each pixel, at how many of the times in the middle of equal steps each primitive is the nearest
+/// occluder.
 fn picture(
     geometry: &InstancedGeometry,
     segment: &ViewSegment,
     sampling: Sampling,
     state: u32,
     path: TimePath,
-) -> BTreeMap<u32, (f64, f64)> {
+) -> Vec<BTreeMap<u32, u32>> {
     let frame = RectifiedFrame::new(segment).unwrap();
-    let mut caster = RayCaster::new();
+    let (rows, columns) = (sampling.rows() as usize, sampling.columns() as usize);
+    let look = |caster: &mut RayCaster, pixel: usize| {
+        let face = frame.face(pixel / (rows * columns));
+        let (row, column) = (pixel / columns % rows, pixel % columns);
+        let (w, c) = (sampling.row(row as u32), sampling.column(column as u32));
+        let direction = face.axis * c + face.up * w + face.forward;
+        let mut seen = BTreeMap::new();
+        for k in 0..TIMES {
+            let s = (f64::from(k) + 0.5) / f64::from(TIMES);
+            let t = path.t0 + s * (path.t1 - path.t0);
+            let origin = segment.v0.lerp(segment.v1, s);
+            let ray = Ray { origin, direction, moment: Moment { state, t } };
+            if let Some(hit) = caster.closest_occluder(geometry, ray, f64::INFINITY, |_| true) {
+                *seen.entry(hit.primitive.0).or_insert(0) += 1;
+            }
+        }
+        seen
+    };
+    (0..FACE_COUNT * rows * columns).into_par_iter().map_init(RayCaster::new, look).collect()
+}
+
+/// The intervals of each pixel.
+fn lists(
+    geometry: &InstancedGeometry,
+    segment: &ViewSegment,
+    sampling: Sampling,
+    state: u32,
+    path: TimePath,
+) -> Vec<(Pixel, Vec<Interval>)> {
+    let mut out = Vec::new();
+    visit_intervals(geometry, segment, sampling, state, path, |pixel, intervals| {
+        out.push((pixel, intervals.to_vec()));
+    });
+    out
+}
+
+/// Panics where a pixel's intervals are not what its picture shows. An interval of length l holds more
+/// than l TIMES - 1 and less than l TIMES + 1 of the times, and its ends may be off by their errors.
+fn assert_seen(seen: &BTreeMap<u32, u32>, intervals: &[Interval], pixel: Pixel) {
+    let step = 1.0 / f64::from(TIMES);
+    let found: BTreeSet<u32> = intervals.iter().map(|i| i.primitive).collect();
+    for &primitive in found.iter().chain(seen.keys()) {
+        let shown = f64::from(seen.get(&primitive).copied().unwrap_or(0)) * step;
+        let own = intervals.iter().filter(|i| i.primitive == primitive);
+        let (length, off) = own.fold((0.0, 0.0), |(length, off), i| {
+            (length + (i.end - i.start), off + step + i.start_error + i.end_error)
+        });
+        assert!(
+            (length - shown).abs() <= off,
+            "{pixel:?}, {primitive}: {length} of {intervals:?}, {shown} of the picture"
+        );
+    }
+}
+
+/// The share of (directions x segment) of each primitive, from the intervals that count.
+fn shares(sampling: Sampling, lists: &[(Pixel, Vec<Interval>)]) -> BTreeMap<u32, f64> {
     let mut out = BTreeMap::new();
-    for face in (0..FACE_COUNT).map(|f| frame.face(f)) {
-        for (row, column) in
-            (0..sampling.rows()).flat_map(|r| (0..sampling.columns()).map(move |c| (r, c)))
-        {
-            let (w, c) = (sampling.row(row), sampling.column(column));
-            let direction = face.axis * c + face.up * w + face.forward;
-            let (i, j) = (f64::from(row), f64::from(column));
-            let angle = Sampling::solid_angle(
-                sampling.c(j),
-                sampling.c(j + 1.0),
-                sampling.w(i),
-                sampling.w(i + 1.0),
-            ) / (4.0 * std::f64::consts::PI);
-            let mut seen: BTreeMap<u32, u32> = BTreeMap::new();
-            for k in 0..TIMES {
-                let s = (f64::from(k) + 0.5) / f64::from(TIMES);
-                let t = path.t0 + s * (path.t1 - path.t0);
-                let origin = segment.v0.lerp(segment.v1, s);
-                let ray = Ray { origin, direction, moment: Moment { state, t } };
-                if let Some(hit) = caster.closest_occluder(geometry, ray, f64::INFINITY, |_| true) {
-                    *seen.entry(hit.primitive.0).or_insert(0) += 1;
-                }
-            }
-            for (primitive, times) in seen {
-                let sum = out.entry(primitive).or_insert((0.0, 0.0));
-                sum.0 += angle * f64::from(times) / f64::from(TIMES);
-                sum.1 += angle;
-            }
+    for (pixel, intervals) in lists {
+        let (i, j) = (f64::from(pixel.row), f64::from(pixel.column));
+        let (c, w) = (|j: f64| sampling.c(j), |i: f64| sampling.w(i));
+        let angle = Sampling::solid_angle(c(j), c(j + 1.0), w(i), w(i + 1.0));
+        for interval in intervals.iter().filter(|i| i.counts()) {
+            let share = angle / (4.0 * std::f64::consts::PI) * (interval.end - interval.start);
+            *out.entry(interval.primitive).or_insert(0.0) += share;
         }
     }
     out
@@ -89,15 +132,18 @@ fn compare(geometry: &InstancedGeometry, segment: &ViewSegment, path: TimePath) 
             "each state is as if it were alone"
         );
         assert_eq!(alone[0].visibility.weights, run.visibility.weights);
-        let found = weights(run);
-        let seen = picture(geometry, segment, sampling, state, path);
-        for primitive in 0..geometry.primitive_count() {
-            let a = found.get(&primitive).copied().unwrap_or(0.0);
-            let (b, directions) = seen.get(&primitive).copied().unwrap_or((0.0, 0.0));
-            // Up to four intervals a pixel, each end right to half a step of time; and some pixels in
-            // which it is seen for less than a step.
-            let tolerance = 4.0 * directions / f64::from(TIMES) + 3e-5;
-            assert!((a - b).abs() <= tolerance, "state {state}, {primitive}: {a} {b} {tolerance}");
+        let lists = lists(geometry, segment, sampling, state, path);
+        let picture = picture(geometry, segment, sampling, state, path);
+        for (pixel, intervals) in &lists {
+            assert_seen(&picture[number(sampling, *pixel)], intervals, *pixel);
+        }
+        let (found, sums) = (weights(run), shares(sampling, &lists));
+        assert!(found.keys().eq(sums.keys()), "state {state}: {found:?} {sums:?}");
+        for ((primitive, a), b) in found.iter().zip(sums.values()) {
+            // Stored as `f32`. A solid angle is a sum of four arcs, each right to 4 roundings of pi / 2:
+            // in the solver's order and in this one, 4 roundings of the whole for a pixel.
+            let off = f64::from(f32::EPSILON) * b + 4.0 * f64::EPSILON * lists.len() as f64;
+            assert!((a - b).abs() <= off, "state {state}, {primitive}: {a} {b}");
         }
     }
 }
@@ -182,8 +228,14 @@ fn scene() -> impl Strategy<Value = InstancedGeometry> {
         })
 }
 
+/// The same cases each time: a change is judged by what it changes.
+fn short_form() -> ProptestConfig {
+    let rng_seed = proptest::test_runner::RngSeed::Fixed(20_261_122);
+    ProptestConfig { cases: 16, rng_seed, ..ProptestConfig::default() }
+}
+
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(24))]
+    #![proptest_config(short_form())]
 
     #[test]
     fn what_moves_is_seen_where_it_is(

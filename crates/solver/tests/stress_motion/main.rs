@@ -19,7 +19,7 @@ use suite::{
 };
 
 /// Each family is run until it has had this many pixels.
-const PIXELS: u64 = 8_000;
+const PIXELS: u64 = 5_000;
 
 fn assert_explained(name: &str) {
     let family = FAMILIES.iter().chain(BALLS).find(|f| f.name == name).expect("there is one");
@@ -83,7 +83,10 @@ agree_with_exact_arithmetic! {
 /// the camera at its tip was 0 / 0; a sphere that passes fast had ends that were off by more than they
 /// said, on its silhouette and on its surface; so had a triangle at the camera plane; a fast triangle was as
 /// uncertain as where it is farthest, and so was where it is in front; and one whose plane touches the camera
-/// in the middle of an interval was not seen at all.
+/// in the middle of an interval, or that is flat for an instant there, was not seen at all; of equal triangles
+/// that begin with other corners one with a higher number was seen, as their depths were rounded apart; and
+/// with a corner of two long sides to begin with, slivers were off by more than they need; and two spheres
+/// changed places where their polynomial's noise did, not where their depths do.
 #[test]
 fn formerly_failing_cases_are_explained() {
     let cases = [
@@ -94,7 +97,17 @@ fn formerly_failing_cases_are_explained() {
         ("speed", 36),
         ("speed", 139),
         ("speed", 432),
+        ("speed", 925),
         ("lattice", 1263),
+        ("lattice", 1433),
+        ("twice", 297),
+        ("twice", 355),
+        ("sliver", 399),
+        ("sliver", 1263),
+        ("ball-lattice", 288),
+        ("ball-lattice", 547),
+        ("ball-lattice", 715),
+        ("ball-graze", 53),
     ];
     for (name, seed) in cases {
         let family = FAMILIES.iter().chain(BALLS).find(|f| f.name == name).expect("there is one");
@@ -113,7 +126,7 @@ fn assert_no_leak(place: &str) {
     for family in SHELLS.iter().filter(|f| f.name.starts_with(place)) {
         let mut tally = Tally::default();
         let mut seed = 0;
-        while tally.pixels < 25 * PIXELS {
+        while tally.pixels < 10 * PIXELS {
             tally.add(run_closed(family, seed));
             seed += 1;
         }
@@ -131,9 +144,18 @@ fn what_a_moving_closed_mesh_holds_is_not_found() {
     assert_no_leak("front");
 }
 
+/// Formerly leaking: a corner that passes a row plane one rounding before the end of the state, after which
+/// no edge was found to be cut.
+#[test]
+fn formerly_leaking_meshes_have_no_gap() {
+    let family = SHELLS.iter().find(|f| f.name == "around-carried").expect("there is one");
+    let tally = run_closed(family, 34);
+    assert!(tally.unexplained.is_empty(), "{}", tally.unexplained.join("\n"));
+}
+
 #[test]
 fn roots_of_quadratics_are_right_to_4_ulp() {
-    let wrong = quadratics::run(0, 50_000);
+    let wrong = quadratics::run(0, 30_000);
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }
 
@@ -175,7 +197,7 @@ fn one_two_and_eight_threads_give_the_same_bits() {
     let pools = [1, 2, 8].map(|threads| {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads start")
     });
-    all_cases(3, |family, seed, case, _| {
+    all_cases(2, |family, seed, case, _| {
         let of = |pool: &rayon::ThreadPool| pool.install(|| solve(&case, &SolveOptions::default()));
         let [one, two, eight] = pools.each_ref().map(of);
         assert_eq!(one, two, "{} {seed}", family.name);
@@ -185,7 +207,7 @@ fn one_two_and_eight_threads_give_the_same_bits() {
 
 #[test]
 fn volumes_and_wide_instructions_change_no_bit() {
-    all_cases(6, |family, seed, case, _| {
+    all_cases(3, |family, seed, case, _| {
         let base = found(&solve(&case, &SolveOptions::default()));
         let without = SolveOptions { without_volumes: true, ..SolveOptions::default() };
         assert_eq!(base, found(&solve(&case, &without)), "volumes: {} {seed}", family.name);
@@ -203,7 +225,7 @@ const WITHOUT_TIES: &[&str] =
 /// other result is judged on its own.
 #[test]
 fn the_order_of_triangles_instances_and_particles_does_not_matter() {
-    all_cases(4, |family, seed, case, mut random| {
+    all_cases(3, |family, seed, case, mut random| {
         let name = family.name;
         let (other, before) = shuffled(&case, &mut random);
         if WITHOUT_TIES.contains(&name) {

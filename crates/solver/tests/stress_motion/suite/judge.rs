@@ -14,8 +14,8 @@
 //!   2 D (1 + |c|) and 2 D (1 + |w|). A primitive that a ray may then meet or miss is open.
 //! - *Depth of a triangle.* Corners that move by 2 D in each coordinate move its plane by 2 sqrt(3) D along
 //!   the normal n, so the depth by 2 sqrt(3) D |n| / |n . d|. N and D of the solver are rounded, by e_N =
-//!   gamma(16) |n|' q' and e_D = gamma(12) |n|' (1 + |c|), with |n|' twice the product of the largest sides
-//!   and q' the reach of a corner; a depth is off by (e_N + z e_D) / |n . d|. What is closer than twice
+//!   gamma(16) |n|' q' and e_D = gamma(12) |n|' (1 + |c|), with |n|' twice the product of the two shortest
+//!   sides, each as long as it can be at any time, and q' the reach of a corner; a depth is off by (e_N + z e_D) / |n . d|. What is closer than twice
 //!   that where D is least on a stretch, which is at most half of its largest, counts as equal, and so does a
 //!   band that is half as thick: 8 (e_N + z e_D) / |n . d| in all. No depth is beyond those of the corners,
 //!   but what counts as equal may be: where a triangle is fast, the solver's bound is that much too large.
@@ -159,12 +159,27 @@ fn flat(form: &Form) -> Flat {
     }
 }
 
+/// A triangle with its corners in an order of their own: two are equal whichever corner they begin with
+/// and whichever way they turn.
+fn in_order(form: Form) -> Form {
+    match form {
+        Form::Triangle([start, end]) => {
+            let mut corners: Vec<_> = start.into_iter().zip(end).collect();
+            corners.sort();
+            let corners: [_; 3] = corners.try_into().expect("a triangle has three corners");
+            Form::Triangle([corners.clone().map(|c| c.0), corners.map(|c| c.1)])
+        }
+        sphere @ Form::Sphere(..) => sphere,
+    }
+}
+
 impl Judge {
     pub fn new(case: &MovingCase) -> Option<Self> {
         let frame = RectifiedFrame::new(&case.segment)?;
         let mut solids: Vec<Body> = Vec::new();
-        for body in bodies(&case.geometry, &frame, case.state, case.path) {
+        for mut body in bodies(&case.geometry, &frame, case.state, case.path) {
             // Of equal primitives the lowest number is seen, always.
+            body.form = in_order(body.form);
             if body.occluder && !solids.iter().any(|s| s.form == body.form) {
                 solids.push(body);
             }
@@ -392,20 +407,25 @@ impl Along<'_> {
         z: f64,
     ) -> (f64, f64) {
         let length = |v: [f64; 3]| (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
-        let side = |p: &[[f64; 3]; 3], k: usize| -> [f64; 3] {
-            std::array::from_fn(|i| p[k][i] - p[0][i])
+        let side = |p: &[[f64; 3]; 3], k: usize, j: usize| -> [f64; 3] {
+            std::array::from_fn(|i| p[k][i] - p[j][i])
         };
-        let largest = |k: usize| {
-            let (a, b) = (side(p, k), side(q, k));
+        let largest = |k: usize, j: usize| {
+            let (a, b) = (side(p, k, j), side(q, k, j));
             length(std::array::from_fn(|i| a[i].abs().max(b[i].abs())))
         };
-        let normal_size = 2.0 * largest(1) * largest(2);
-        let reach = length(std::array::from_fn(|i| {
-            let way = if i == 0 { self.judge.length } else { 0.0 };
-            p[0][i].abs().max((q[0][i] - way).abs())
-        }));
+        let sides = [largest(1, 0), largest(2, 1), largest(0, 2)];
+        let pairs = (0..3).map(|k| sides[k] * sides[(k + 1) % 3]);
+        let normal_size = 2.0 * pairs.fold(f64::INFINITY, f64::min);
+        let reach = |k: usize| {
+            length(std::array::from_fn(|i| {
+                let way = if i == 0 { self.judge.length } else { 0.0 };
+                p[k][i].abs().max((q[k][i] - way).abs())
+            }))
+        };
+        let reach = (0..3).map(reach).fold(0.0, f64::max);
         let now = corners.map(|p| p.map(|x| x.v));
-        let (a, b) = (side(&now, 1), side(&now, 2));
+        let (a, b) = (side(&now, 1, 0), side(&now, 2, 0));
         let n = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
         let along = (n[0] * self.c + n[1] * self.w + n[2]).abs();
         let moved = 2.0 * 3f64.sqrt() * self.judge.bounds.depth * length(n);
