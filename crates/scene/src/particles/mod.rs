@@ -95,14 +95,16 @@ fn read(path: &Path, source: &Source, max_spheres: u64) -> Result<ParticleTable,
     if survey.bounds.is_empty() {
         return Err(TableProblem::Empty.into());
     }
-    let Survey { numbers, key_times, bounds, reaches, .. } = survey;
-    let mut by_id: Vec<(u32, u32)> = numbers.into_iter().collect();
-    by_id.sort_unstable();
-    let reaches = by_id.iter().filter_map(|(_, k)| reaches.get(*k as usize).copied()).collect();
-    let ids: Vec<u32> = by_id.into_iter().map(|(id, _)| id).collect();
+    let Survey { particles, key_times, bounds, reaches: found, .. } = survey;
+    let (ranks, ids) = particles.sorted();
+    let mut reaches = found.clone();
+    for (rank, reach) in ranks.iter().zip(found) {
+        reaches[*rank as usize] = reach;
+    }
     let mut filling = Filling {
         origin: bounds.center().round(),
-        numbers: ids.iter().zip(0..).map(|(&id, number)| (id, number)).collect(),
+        particles,
+        ranks,
         keys: Vec::with_capacity(key_times.len()),
         key_frames: key_times.len(),
     };
@@ -115,10 +117,54 @@ fn read(path: &Path, source: &Source, max_spheres: u64) -> Result<ParticleTable,
     Ok(ParticleTable { path, origin, key_times, keys, ids, reaches, size, hash })
 }
 
+/// Particles in order of their first rows, found by the author's numbers.
+///
+/// Writers keep an order from key frame to key frame, so the next row most often is of the particle that
+/// followed before; only where it is not is the table of all particles asked.
+#[derive(Default)]
+struct Appearance {
+    /// The author's numbers.
+    ids: Vec<u32>,
+    places: HashMap<u32, u32>,
+    /// The particle behind the one that was found last.
+    next: u32,
+}
+
+impl Appearance {
+    fn find(&mut self, id: u32) -> Option<u32> {
+        let expected = if self.next as usize == self.ids.len() { 0 } else { self.next };
+        let found = match self.ids.get(expected as usize) {
+            Some(own) if *own == id => expected,
+            _ => *self.places.get(&id)?,
+        };
+        self.next = found + 1;
+        Some(found)
+    }
+
+    /// Adds one that was not found.
+    fn add(&mut self, id: u32) -> u32 {
+        let place = self.ids.len() as u32;
+        self.ids.push(id);
+        self.places.insert(id, place);
+        self.next = place + 1;
+        place
+    }
+
+    /// For each, its place in the order of the author's numbers, and those numbers ascending.
+    fn sorted(&self) -> (Vec<u32>, Vec<u32>) {
+        let mut by_id: Vec<(u32, u32)> = self.ids.iter().copied().zip(0..).collect();
+        by_id.sort_unstable();
+        let mut ranks = vec![0; by_id.len()];
+        for ((_, place), rank) in by_id.iter().zip(0..) {
+            ranks[*place as usize] = rank;
+        }
+        (ranks, by_id.into_iter().map(|(id, _)| id).collect())
+    }
+}
+
 /// What the first reading of a table finds.
 struct Survey {
-    /// Particles by the author's number: in order of appearance.
-    numbers: HashMap<u32, u32>,
+    particles: Appearance,
     /// The key frame at which a particle was seen last, by order of appearance.
     last_seen: Vec<u32>,
     /// What the rows say of each, by order of appearance; empty where they say nothing.
@@ -132,7 +178,7 @@ struct Survey {
 impl Default for Survey {
     fn default() -> Self {
         Self {
-            numbers: HashMap::new(),
+            particles: Appearance::default(),
             last_seen: Vec::new(),
             reaches: Vec::new(),
             key_times: Vec::new(),
@@ -145,15 +191,20 @@ impl Default for Survey {
 impl Survey {
     fn add(&mut self, row: &Row) -> Result<(), TableProblem> {
         self.enter_key_frame(row)?;
-        let next = self.last_seen.len() as u32;
-        let number = *self.numbers.entry(row.particle).or_insert(next);
-        if number == next {
-            self.last_seen.push(row.state);
-        } else if self.last_seen[number as usize] == row.state {
-            let (place, particle, state) = (row.place, row.particle, row.state);
-            return Err(TableProblem::Twice { place, particle, state });
-        }
-        self.last_seen[number as usize] = row.state;
+        let number = match self.particles.find(row.particle) {
+            None => {
+                self.last_seen.push(row.state);
+                self.particles.add(row.particle)
+            }
+            Some(number) => {
+                let last = std::mem::replace(&mut self.last_seen[number as usize], row.state);
+                if last == row.state {
+                    let (place, particle, state) = (row.place, row.particle, row.state);
+                    return Err(TableProblem::Twice { place, particle, state });
+                }
+                number
+            }
+        };
         if let Some(reach) = row.reach {
             match self.reaches.get_mut(number as usize) {
                 Some(before) => *before = before.or_looser(reach),
@@ -203,8 +254,9 @@ impl Survey {
 /// What the second reading of a table fills.
 struct Filling {
     origin: DVec3,
-    /// Our numbers by the author's.
-    numbers: HashMap<u32, u32>,
+    particles: Appearance,
+    /// Our numbers, by order of appearance.
+    ranks: Vec<u32>,
     keys: Vec<Vec<Sphere>>,
     /// Key frames of the first reading.
     key_frames: usize,
@@ -213,13 +265,14 @@ struct Filling {
 impl Filling {
     fn add(&mut self, row: &Row) -> Result<(), TableProblem> {
         if row.state as usize == self.keys.len() && self.keys.len() < self.key_frames {
-            self.keys.push(vec![Sphere::ABSENT; self.numbers.len()]);
+            self.keys.push(vec![Sphere::ABSENT; self.ranks.len()]);
         }
         // The rows were sound when they were read before.
-        let number = self.numbers.get(&row.particle).ok_or(TableProblem::Changed)?;
+        let found = self.particles.find(row.particle).ok_or(TableProblem::Changed)?;
+        let number = self.ranks[found as usize];
         let spheres = self.keys.get_mut(row.state as usize).ok_or(TableProblem::Changed)?;
         let center = (row.center - self.origin).as_vec3().to_array();
-        spheres[*number as usize] = Sphere { center, radius: row.radius as f32 };
+        spheres[number as usize] = Sphere { center, radius: row.radius as f32 };
         Ok(())
     }
 }

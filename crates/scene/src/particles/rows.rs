@@ -1,6 +1,6 @@
 //! Rows of a table, one after the other, from Parquet or CSV.
 //!
-//! Promise: memory is a batch of [`BATCH_ROWS`] rows, whatever the file claims; a row is either handed
+//! Promise: memory is a few batches of [`BATCH_ROWS`] rows, whatever the file claims; a row is either handed
 //! on with sound values or refused with its place. The order of rows is the caller's business.
 
 use std::{
@@ -8,6 +8,7 @@ use std::{
     io::{self, BufReader, Read, Seek},
     panic::{AssertUnwindSafe, catch_unwind},
     path::Path,
+    sync::mpsc,
 };
 
 use arrow_array::{
@@ -37,6 +38,8 @@ use crate::{
 
 /// Rows that are decoded at once.
 const BATCH_ROWS: usize = 8192;
+/// Batches that are decoded ahead of who takes them.
+const BATCHES_AHEAD: usize = 2;
 /// Largest time of a key frame, seconds: differences of times stay finite and exact to a
 /// millisecond.
 const TIME_MAX: f64 = 1e12;
@@ -318,14 +321,26 @@ fn parquet_rows<T: ChunkReader + 'static>(input: T, each: Each<'_>) -> Result<()
         let builder = builder.with_projection(mask).with_batch_size(BATCH_ROWS);
         builder.build().map_err(|e| e.to_string())
     })?;
-    let mut first = 0;
-    loop {
-        let place = RowPlace { row: first, line: None };
-        let next = || reader.next().transpose().map_err(|e| e.to_string());
-        let Some(batch) = guarded(Some(place), next)? else { return Ok(()) };
-        batch_rows(&batch, first, each)?;
-        first += batch.num_rows() as u64;
-    }
+    // One thread decodes while the other takes the rows.
+    std::thread::scope(|scope| {
+        let (sender, batches) = mpsc::sync_channel(BATCHES_AHEAD);
+        scope.spawn(move || {
+            let mut first = 0;
+            loop {
+                let place = RowPlace { row: first, line: None };
+                let next = || reader.next().transpose().map_err(|e| e.to_string());
+                let Some(batch) = guarded(Some(place), next).transpose() else { return };
+                let rows = batch.as_ref().ok().map(RecordBatch::num_rows);
+                // Nobody takes what follows an error, be it ours or of who takes the rows.
+                let (Ok(()), Some(rows)) = (sender.send((first, batch)), rows) else { return };
+                first += rows as u64;
+            }
+        });
+        for (first, batch) in batches {
+            batch_rows(&batch?, first, each)?;
+        }
+        Ok(())
+    })
 }
 
 fn check_type(column: &'static str, integer: bool, found: &DataType) -> Result<(), TableProblem> {
@@ -342,9 +357,8 @@ fn batch_rows(batch: &RecordBatch, first: u64, each: Each<'_>) -> Result<(), Tab
     let column = |k: usize| batch.column_by_name(COLUMNS[k]).map(|array| (k, &**array));
     let place = |row: usize| RowPlace { row: first + row as u64, line: None };
     for (k, array) in (0..COLUMNS.len()).filter_map(column) {
-        if let Some(row) =
-            (0..array.len()).find(|&row| array.null_count() > 0 && array.is_null(row))
-        {
+        let nulls = array.null_count();
+        if let Some(row) = (0..array.len()).find(|&row| nulls > 0 && array.is_null(row)) {
             return Err(TableProblem::Value {
                 place: place(row),
                 column: COLUMNS[k],
