@@ -557,24 +557,53 @@ impl TileSolver {
                 continue;
             }
             let length = context.frame.length;
-            let triangle = MovingTriangle::new(from.triangle(lane), to.triangle(lane), length);
+            let (from, to) = (from.triangle(lane), to.triangle(lane));
+            let stretches = self.moving_stretches(context, &from, &to);
+            // What is small falls between the columns.
+            if stretches.iter().all(Range::is_empty) {
+                continue;
+            }
+            let triangle = MovingTriangle::new(from, to, length);
             let primitive = first_primitive + lane as u32;
             for row in rows {
-                self.moving_row(walk, &triangle, &entry, row, primitive);
+                self.moving_row(walk, &triangle, (&entry, &stretches), row, primitive);
             }
         }
+    }
+
+    /// For each column, the bins in which a triangle that moves can be met; empty where it never is.
+    #[inline(always)]
+    fn moving_stretches(
+        &self,
+        context: &TileContext,
+        from: &[DVec3; 3],
+        to: &[DVec3; 3],
+    ) -> [Range<usize>; TILE_COLUMNS] {
+        let length = context.frame.length;
+        std::array::from_fn(|k| {
+            let c = self.columns[k].c;
+            let slack = 2.0 * context.bounds.depth * (1.0 + c.abs());
+            let reach = |corners: &[DVec3; 3]| {
+                let [p, q, r] = corners.map(|p| p.x - c * p.z);
+                (least(p, least(q, r)) - slack, largest(p, largest(q, r)) + slack)
+            };
+            let (a, b) = (reach(from), reach(to));
+            match times((a.0, b.0 - length), (a.1, b.1 - length)) {
+                Some((start, end)) => bin_of(start)..bin_of(end) + 1,
+                None => 0..0,
+            }
+        })
     }
 
     fn moving_row(
         &mut self,
         walk: &Walk,
         triangle: &MovingTriangle,
-        entry: &Entry,
+        (entry, stretches): (&Entry, &[Range<usize>; TILE_COLUMNS]),
         row: usize,
         primitive: u32,
     ) {
-        let bins = entry.first_bin as usize..=entry.last_bin as usize;
-        let hidden = (0..TILE_COLUMNS).all(|k| {
+        let hidden = stretches.iter().enumerate().all(|(k, bins)| {
             let far = self.envelopes.far(row * TILE_COLUMNS + k);
             far[bins.clone()].iter().all(|&far| entry.near > far)
         });
@@ -584,7 +613,10 @@ impl TileSolver {
         let bounds = walk.context.bounds;
         let Some(in_row) = MovingRow::new(triangle, self.rows[row], bounds) else { return };
         self.counters.cuts += 1;
-        for k in 0..TILE_COLUMNS {
+        for (k, bins) in stretches.iter().enumerate() {
+            if bins.is_empty() {
+                continue;
+            }
             let c = self.columns[k].c;
             in_row.coverage(c, bounds, |covered| {
                 let arc = || in_row.arc(c, &covered, bounds);
