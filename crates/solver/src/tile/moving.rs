@@ -132,8 +132,12 @@ impl TileSolver {
         {
             return;
         }
-        self.keep_base();
         let end = motion.states.last().map_or(0, |last| last + 1);
+        self.refresh_far();
+        if motion.volumes && self.sees_no_motion(context, motion, end) {
+            return;
+        }
+        self.keep_base();
         for (number, &state) in motion.states.iter().enumerate() {
             if number > 0 {
                 self.envelopes.copy_from(&self.moving.base);
@@ -157,12 +161,54 @@ impl TileSolver {
         }
     }
 
-    /// Keeps what rests as it is in the lists now.
-    fn keep_base(&mut self) {
+    fn refresh_far(&mut self) {
         for row in 0..self.row_far.len() {
             self.refresh_row(row);
         }
         self.tile_far = Far::of(self.row_far.iter().map(|far| &far.depths));
+    }
+
+    /// Whether one volume a hierarchy, over all states, shows that nothing that moves is seen. Most tiles
+    /// of a scene in which little moves need no more.
+    fn sees_no_motion(&mut self, context: &TileContext, motion: &Motion, end: u32) -> bool {
+        let Some(&state) = motion.states.first() else { return true };
+        let geometry = context.geometry;
+        self.moving.spaces.clear();
+        let (mut volumes, mut items) = (0, 0);
+        let mut hidden = |this: &mut Self, walk: &Walk, of, origin, hierarchy: &MovingHierarchy| {
+            volumes += 1;
+            items += u64::from(hierarchy.nodes[0].items);
+            let swept = hierarchy.swept(0, state..end);
+            let space = this.add_space(context, of, resting(context, origin));
+            swept.is_empty()
+                || this
+                    .entry_in_beam(walk, space, 0, (&swept, &swept))
+                    .is_none_or(|entry| this.is_hidden_in_rows(&entry))
+        };
+        for pass in [Pass::Occluders, Pass::SeeThrough] {
+            let walk = Walk { context, motion, state, end, pass };
+            let level = walk.level();
+            if !level.instances.is_empty()
+                && !hidden(self, &walk, Of::Level, geometry.origin, &level.hierarchy)
+            {
+                return false;
+            }
+        }
+        for (number, system) in (0..).zip(&geometry.particles) {
+            let walk = Walk { context, motion, state, end, pass: Pass::Occluders };
+            if !system.is_empty()
+                && !hidden(self, &walk, Of::Particles(number), system.origin, &system.hierarchy)
+            {
+                return false;
+            }
+        }
+        self.counters.volumes += volumes;
+        self.counters.skipped += items * motion.states.len() as u64;
+        true
+    }
+
+    /// Keeps what rests as it is in the lists now.
+    fn keep_base(&mut self) {
         let m = &mut self.moving;
         m.volumes.clear();
         m.base.copy_from(&self.envelopes);
@@ -178,19 +224,15 @@ impl TileSolver {
         self.moving.spaces.clear();
         self.stack.clear();
         let level = walk.level();
-        let face_from_world = context.face.face_from_world();
-        let resting = |origin: DVec3| {
-            let map = (face_from_world, face_from_world * (origin - context.frame.v0));
-            [map, map]
-        };
         if !level.instances.is_empty() {
-            let space = self.add_space(context, Of::Level, resting(geometry.origin));
+            let space = self.add_space(context, Of::Level, resting(context, geometry.origin));
             let root = self.seen_node(walk, space, 0, &level.hierarchy);
             self.stack.extend(root);
         }
         for (number, system) in (0..).zip(&geometry.particles) {
             if system.occluder == (walk.pass == Pass::Occluders) && !system.is_empty() {
-                let space = self.add_space(context, Of::Particles(number), resting(system.origin));
+                let map = resting(context, system.origin);
+                let space = self.add_space(context, Of::Particles(number), map);
                 let root = self.seen_node(walk, space, 0, &system.hierarchy);
                 self.stack.extend(root);
             }
@@ -715,6 +757,13 @@ impl TileSolver {
             }
         }
     }
+}
+
+/// Face coordinates of a space that rests, from those relative to its origin.
+fn resting(context: &TileContext, origin: DVec3) -> [(DMat3, DVec3); 2] {
+    let face_from_world = context.face.face_from_world();
+    let map = (face_from_world, face_from_world * (origin - context.frame.v0));
+    [map, map]
 }
 
 /// The t in [0, 1] at which something may be met: where the least of x - c_hi z is not above, and the
