@@ -16,6 +16,9 @@
 //!   for the interpolation: gamma(16) S + gamma(24) R off the line in all.
 //! - *Depth*: z of a cut at t is interpolated between its ends: 4 u S more, and the error of t
 //!   times the slope of the cut.
+//! - *Motion*: a vertex between two key frames is (1 - t) a + t b, 3 roundings of terms of at most S, so
+//!   gamma(15) (S + 2 R) in all; centres of particles likewise. What follows for cuts and ends then is
+//!   gamma(19) S + gamma(30) R.
 //! - *Time*: t = (x - c z) / L: (gamma(19) S + gamma(24) R) (1 + |c|) / L.
 //!
 //! All are rounded up to gamma(32) (S + R), which leaves room for the second-order terms.
