@@ -28,7 +28,8 @@
 //!   on any number of threads (VI-3);
 //! - all weights of occluders add up to at most the whole: a ray's share of the directions is
 //!   divided between it and the finer rays around it (of primitives; units have weights of one pass);
-//! - to look no further changes neither which units are visible nor what may be missing.
+//! - to look no further changes neither what may be missing nor which units are visible, but for units
+//!   that are known anyway: those may be left out.
 
 use rayon::prelude::*;
 use std::ops::Range;

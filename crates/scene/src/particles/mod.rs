@@ -15,8 +15,9 @@
 //! - nothing is kept for what the limit on spheres does not allow: particles times key frames are
 //!   counted before memory is reserved.
 //!
-//! Parts: `rows` parses; `reach` makes balls of rows that say how far a particle may stray; `key_times` brings tables and animations to the same key frames;
-//! `problem` says what is wrong; `table_writer` writes tables.
+//! Parts: `rows` parses; `reach` makes balls of rows that say how far a particle may stray; `key_times`
+//! brings tables and animations to the same key frames; `problem` says what is wrong; `table_writer`
+//! writes tables.
 
 mod key_times;
 mod problem;

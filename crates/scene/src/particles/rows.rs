@@ -1,7 +1,8 @@
 //! Rows of a table, one after the other, from Parquet or CSV.
 //!
-//! Promise: memory is a few batches of [`BATCH_ROWS`] rows, whatever the file claims; a row is either handed
-//! on with sound values or refused with its place. The order of rows is the caller's business.
+//! Promise: memory is a few batches of [`BATCH_ROWS`] rows, whatever the file claims; a row is either
+//! handed on with sound values or refused with its place. The order of rows is the caller's business.
+//! Rows come in the order of the file, though Parquet is decoded on a thread of its own.
 
 use std::{
     fs::File,
