@@ -8,14 +8,17 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures::Stream;
 use sightline_jobs::{BakeStatus, Outcome, Phase, Plan, SchedulePolicy};
 use sightline_proto::v1::coordinator_server::CoordinatorServer;
 use sightline_proto::{MESSAGE_BYTES_MAX, v1};
 use sightline_store::BakeStore;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::TcpListenerStream;
+use tonic::transport::server::Connected;
 
 use crate::CoordinatorError;
 use crate::clock::{Clock, MonotonicClock};
@@ -49,6 +52,8 @@ pub struct CoordinatorOptions {
     pub linger: Duration,
     /// The clock that leases are measured with.
     pub clock: Arc<dyn Clock>,
+    /// Tells coordinators that race for an epoch apart: no two may have the same.
+    pub name: String,
 }
 
 impl CoordinatorOptions {
@@ -69,6 +74,7 @@ impl CoordinatorOptions {
             worker_wait: None,
             linger: Duration::from_secs(5),
             clock: Arc::new(MonotonicClock::default()),
+            name: unique_name(),
         }
     }
 }
@@ -94,9 +100,21 @@ pub struct CoordinatorHandle {
     status: watch::Receiver<BakeStatus>,
     stop: Option<oneshot::Sender<()>>,
     end: JoinHandle<Result<Summary, CoordinatorError>>,
+    shared: Arc<Shared>,
 }
 
 impl CoordinatorHandle {
+    /// What checks the invariants of the scheduler's state, for simulations: it panics with the first
+    /// that does not hold.
+    pub fn auditor(&self) -> impl Fn() + Send + Sync + 'static {
+        let shared = Arc::downgrade(&self.shared);
+        move || {
+            if let Some(shared) = shared.upgrade() {
+                shared.state().assert_well_formed();
+            }
+        }
+    }
+
     /// The address for workers on this machine, as a URL.
     #[must_use]
     pub fn url(&self) -> String {
@@ -143,10 +161,27 @@ impl Coordinator {
         let addr = listener
             .local_addr()
             .map_err(|source| CoordinatorError::Listen { address: options.listen, source })?;
+        Self::start_on(options, TcpListenerStream::new(listener), addr).await
+    }
+
+    /// As [`Coordinator::start`], with connections that were accepted elsewhere; `addr` is where workers
+    /// reach it.
+    ///
+    /// # Errors
+    /// As [`Coordinator::start`].
+    pub async fn start_on<IO>(
+        options: CoordinatorOptions,
+        incoming: impl Stream<Item = std::io::Result<IO>> + Send + 'static,
+        addr: SocketAddr,
+    ) -> Result<CoordinatorHandle, CoordinatorError>
+    where
+        IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+    {
         let (shared, status) = open_bake(&options, addr).await?;
         let (stop, stopped) = oneshot::channel();
         let (stop_server, server_stopped) = oneshot::channel();
-        let server = tokio::spawn(serve(listener, Arc::clone(&shared), server_stopped));
+        let server = tokio::spawn(serve(incoming, Arc::clone(&shared), server_stopped));
+        let audited = Arc::clone(&shared);
         let run = Run { shared, options, addr, epoch_checked_ms: 0 };
         let end = tokio::spawn(async move {
             let end = run.drive(stopped).await;
@@ -157,7 +192,7 @@ impl Coordinator {
                 Err(error) => end.and(Err(CoordinatorError::Defect(error.to_string()))),
             }
         });
-        Ok(CoordinatorHandle { addr, status, stop: Some(stop), end })
+        Ok(CoordinatorHandle { addr, status, stop: Some(stop), end, shared: audited })
     }
 }
 
@@ -170,7 +205,7 @@ async fn open_bake(
     store.probe().await?;
     let journal = Journal::new(store.clone(), &plan.bake_id);
     journal.write_plan(plan).await?;
-    let epoch = journal.claim_epoch(&coordinator_name(addr)).await?;
+    let epoch = journal.claim_epoch(&format!("{addr} {}", options.name)).await?;
     let committed = journal.committed_tasks().await?;
 
     let mut state = State::new(plan.clone(), epoch, *policy, clock.now_ms());
@@ -199,13 +234,14 @@ async fn open_bake(
     Ok((Arc::new(shared), watched))
 }
 
-/// Tells coordinators that race for an epoch apart: no two have the same address, process and
-/// start. Names only; nothing is decided by the time in it.
-fn coordinator_name(addr: SocketAddr) -> String {
+/// No two coordinators have the same process and start; those on different machines differ by a hash
+/// that starts from random bytes. Names only; nothing is decided by the time in it.
+fn unique_name() -> String {
     let started = std::time::SystemTime::now()
         .duration_since(std::time::UNIX_EPOCH)
         .map_or(0, |since| since.as_nanos());
-    format!("{addr} process {} started {started}", std::process::id())
+    let salt = std::hash::BuildHasher::hash_one(&std::hash::RandomState::new(), started);
+    format!("process {} started {started} {salt:016x}", std::process::id())
 }
 
 /// A path as workers elsewhere on this machine can use it; URLs stay as they are.
@@ -217,11 +253,14 @@ fn absolute(location: &str) -> String {
         .map_or_else(|_| location.to_owned(), |path| path.display().to_string())
 }
 
-async fn serve(
-    listener: TcpListener,
+async fn serve<IO>(
+    incoming: impl Stream<Item = std::io::Result<IO>>,
     shared: Arc<Shared>,
     stopped: oneshot::Receiver<()>,
-) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+) -> Result<(), Box<dyn std::error::Error + Send + Sync>>
+where
+    IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+{
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<CoordinatorServer<Service>>().await;
     let reflection = tonic_reflection::server::Builder::configure()
@@ -235,7 +274,7 @@ async fn serve(
         .add_service(health_service)
         .add_service(reflection)
         .add_service(service)
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async {
+        .serve_with_incoming_shutdown(incoming, async {
             // A dropped sender asks for the end too.
             let _ = stopped.await;
             let _ = draining.send(());
@@ -337,10 +376,12 @@ impl Run {
         for lease in &lost {
             tracing::warn!(task = lease.task.0, worker = %lease.worker, "a lease ran out");
             if self.shared.journal.commit(lease.task).await?.is_some() {
-                self.shared.change(|state, _| state.committed(lease.task, None));
+                self.shared.change(|state, now_ms| state.committed(lease.task, None, now_ms));
             }
         }
-        if !lost.is_empty() {
+        let has_work = self.shared.state().has_work();
+        if has_work {
+            // Whoever waits for a task looks again.
             self.shared.change(|_, _| ());
         }
         Ok(())

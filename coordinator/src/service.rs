@@ -13,7 +13,7 @@ use tonic::{Request, Response, Status};
 
 use crate::clock::Clock;
 use crate::journal::Journal;
-use crate::state::State;
+use crate::state::{Reported, State};
 
 /// How long a lease request waits for a task before it is answered with "wait", ms. Well under
 /// the clients' timeouts; long enough that waiting workers cost nothing.
@@ -110,7 +110,8 @@ impl Service {
         let found = self.0.journal.commit(task).await;
         match found {
             Ok(Some(_)) => {
-                self.0.change(|state, _| state.committed(task, Some((worker, solve_ms))));
+                let reported = Reported { worker, lease, solve_ms };
+                self.0.change(|state, now_ms| state.committed(task, Some(&reported), now_ms));
                 Ok(())
             }
             Ok(None) => {
@@ -176,7 +177,13 @@ impl coordinator_server::Coordinator for Service {
             }
             let name = shortened(request.worker_name);
             tracing::info!(worker = %name, threads = request.threads, "a worker joins");
-            let worker = state.join(name, request.threads, now_ms);
+            let Some(worker) = state.join(name, request.threads, now_ms) else {
+                let count = state.worker_count();
+                tracing::warn!(count, "a worker is refused: as many are here as there may be");
+                return Err(Status::resource_exhausted(format!(
+                    "{count} workers are at hand, as many as there may be; try again"
+                )));
+            };
             Ok(Response::new(v1::RegisterResponse {
                 worker_id: worker.0,
                 epoch: state.epoch,
@@ -239,6 +246,9 @@ impl coordinator_server::Coordinator for Service {
         let (task, lease) = (TaskId(request.task), LeaseId(request.lease_id));
         if task.index() >= self.0.state().plan.tasks.len() {
             return Err(Status::invalid_argument(format!("the plan has no task {task}")));
+        }
+        if self.0.state().holder(lease).is_some_and(|holder| holder != worker) {
+            return Err(Status::permission_denied(format!("lease {lease} is another worker's")));
         }
         match request.result {
             Some(report_request::Result::Committed(done)) => {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use sightline_jobs::{
-    BakeStatus, Done, FailureClass, Lease, LeaseId, Outcome, Phase, Plan, QuarantinedTask,
+    BakeStatus, FailureClass, Lease, LeaseId, Outcome, Phase, Plan, QuarantinedTask,
     SchedulePolicy, Scheduler, TaskId, TaskKind, WorkerId, WorkerStatus,
 };
 
@@ -13,6 +13,15 @@ struct Registered {
     name: String,
     threads: u32,
     tasks_committed: u32,
+}
+
+/// A worker's word that a task is committed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Reported {
+    pub worker: WorkerId,
+    pub lease: LeaseId,
+    /// Time spent in computing, ms.
+    pub solve_ms: u64,
 }
 
 /// Why a bake ends.
@@ -74,11 +83,13 @@ impl State {
     /// Takes over the tasks that were committed before this coordinator.
     pub fn resume(&mut self, committed: impl IntoIterator<Item = TaskId>) {
         for task in committed {
-            if task.index() < self.plan.tasks.len() && self.scheduler.committed(task) {
+            if task.index() < self.plan.tasks.len()
+                && self.scheduler.committed(task, None, self.started_ms)
+            {
                 self.tasks_resumed += 1;
             }
         }
-        self.units_resumed = self.scheduler.units_committed(|_| true);
+        self.units_resumed = (0..TaskKind::KINDS).map(|kind| self.scheduler.units(kind).done).sum();
     }
 
     /// Moves on to a phase; the time spent in the one before is added up.
@@ -130,10 +141,11 @@ impl State {
         self.newer_epoch
     }
 
-    pub fn join(&mut self, name: String, threads: u32, now_ms: u64) -> WorkerId {
-        let id = self.scheduler.join(now_ms);
+    /// Registers a worker; `None` when there are as many as there may be.
+    pub fn join(&mut self, name: String, threads: u32, now_ms: u64) -> Option<WorkerId> {
+        let id = self.scheduler.join(now_ms)?;
         self.registered.insert(id, Registered { name, threads, tasks_committed: 0 });
-        id
+        Some(id)
     }
 
     pub fn knows(&self, worker: WorkerId) -> bool {
@@ -162,11 +174,12 @@ impl State {
         self.scheduler.heartbeat(worker, held, now_ms)
     }
 
-    pub fn committed(&mut self, task: TaskId, by: Option<(WorkerId, u64)>) {
-        let is_news = self.scheduler.committed(task);
-        if let Some((worker, solve_ms)) = by {
-            self.worker_solve_ms += solve_ms;
-            if let Some(worker) = self.registered.get_mut(&worker).filter(|_| is_news) {
+    /// A task's commit object exists; `by` tells who reported it.
+    pub fn committed(&mut self, task: TaskId, by: Option<&Reported>, now_ms: u64) {
+        let is_news = self.scheduler.committed(task, by.map(|r| r.lease), now_ms);
+        if let Some(reported) = by {
+            self.worker_solve_ms += reported.solve_ms;
+            if let Some(worker) = self.registered.get_mut(&reported.worker).filter(|_| is_news) {
                 worker.tasks_committed += 1;
             }
         }
@@ -202,6 +215,23 @@ impl State {
         now_ms.saturating_sub(self.workers_seen_ms)
     }
 
+    /// True when a waiting worker may get a task that it could not get before the last tick.
+    pub fn has_work(&self) -> bool {
+        self.phase == Phase::Solving && self.scheduler.has_work()
+    }
+
+    /// The worker that holds a lease.
+    pub fn holder(&self, lease: LeaseId) -> Option<WorkerId> {
+        self.scheduler.lease_in_force(lease).map(|lease| lease.worker)
+    }
+
+    /// Panics with the first invariant that does not hold.
+    pub fn assert_well_formed(&self) {
+        self.scheduler.assert_well_formed();
+        let at_hand = self.scheduler.workers();
+        assert!(at_hand.keys().all(|w| self.registered.contains_key(w)), "workers have names");
+    }
+
     pub fn outcome(&self) -> Outcome {
         self.scheduler.outcome()
     }
@@ -212,9 +242,7 @@ impl State {
             if self.phase == phase { now_ms.saturating_sub(self.phase_since_ms) } else { 0 }
         };
         let solve_ms = self.solve_ms + in_phase(Phase::Solving);
-        let cells = self.done(|kind| matches!(kind, TaskKind::Cells { .. }));
-        let segments = self.done(|kind| matches!(kind, TaskKind::Segments { .. }));
-        let joins = self.done(|kind| matches!(kind, TaskKind::Join { .. }));
+        let [segments, cells, joins] = std::array::from_fn(|kind| self.scheduler.units(kind));
         let units = (cells.done + segments.done + joins.done).saturating_sub(self.units_resumed);
         BakeStatus {
             bake_id: self.plan.bake_id.clone(),
@@ -247,12 +275,6 @@ impl State {
                 _ => String::new(),
             },
         }
-    }
-
-    fn done(&self, counts: impl Fn(&TaskKind) -> bool) -> Done {
-        let done = self.scheduler.units_committed(|task| counts(&self.plan.task(task).kind));
-        let kinds = self.plan.tasks.iter().map(|task| &task.kind).filter(|kind| counts(kind));
-        Done { done, total: kinds.map(|kind| u64::from(kind.units())).sum() }
     }
 
     fn worker_statuses(&self) -> Vec<WorkerStatus> {

@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use prost::Message;
@@ -21,8 +21,9 @@ use sightline_store::{
 };
 
 use crate::cache::PartCache;
+use crate::compute::{Compute, Computed, Part};
 use crate::error::AttemptError;
-use crate::pool::{Cancel, SolvePool};
+use crate::pool::Cancel;
 use crate::solve::{self, CellOutput, Work};
 
 /// What all attempts at the tasks of one bake share.
@@ -32,12 +33,9 @@ pub(crate) struct Bake {
     timeline: Timeline,
     units: Units,
     pub scene: Arc<Scene>,
-    pub pool: SolvePool,
+    compute: Arc<dyn Compute>,
     cache: Mutex<PartCache>,
 }
-
-/// A part that is ready to be written.
-type Part = (PartKind, Bytes);
 
 /// What a task reads of those that it depends on.
 enum Inputs {
@@ -50,10 +48,10 @@ enum Inputs {
 }
 
 impl Bake {
-    pub fn new(store: BakeStore, plan: Plan, scene: Arc<Scene>, pool: SolvePool) -> Self {
+    pub fn new(store: BakeStore, plan: Plan, scene: Arc<Scene>, compute: Arc<dyn Compute>) -> Self {
         let timeline = plan.timeline();
         let units = Units::new(&scene.geometry, plan.config.solver.granularity);
-        Self { store, plan, timeline, units, scene, pool, cache: Mutex::default() }
+        Self { store, plan, timeline, units, scene, compute, cache: Mutex::default() }
     }
 
     /// Attempts a task; on success its commit exists. Gives the time spent in computing.
@@ -69,17 +67,13 @@ impl Bake {
             TaskKind::Join { .. } => Inputs::Ranges(self.read_ranges(task).await?),
         };
         let (bake, cancelled) = (Arc::clone(self), cancel.clone());
-        let compute = move || {
-            let start = Instant::now();
-            let parts = bake.compute(task, &inputs, &cancelled)?;
-            Ok::<_, AttemptError>((parts, start.elapsed()))
-        };
-        let (parts, solve_time) = self.pool.run(compute).await??;
+        let job = Box::new(move || bake.compute(task, &inputs, &cancelled));
+        let Computed { parts, took } = self.compute.compute(task, job).await?;
         if cancel.is_cancelled() {
             return Err(AttemptError::GivenUp);
         }
         self.write(task, attempt, parts).await?;
-        Ok(solve_time)
+        Ok(took)
     }
 
     /// Solves and encodes. Runs on the solving threads.

@@ -5,11 +5,13 @@
 //! registered with again; one of an epoch older than the newest this worker has seen is refused,
 //! and asked again until it is replaced or the time is up.
 
-use std::time::{Duration, Instant};
+use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
+use std::time::Duration;
 
-use sightline_jobs::FORMAT_VERSION;
+use sightline_jobs::{FORMAT_VERSION, pause_ms};
 use sightline_proto::v1::coordinator_client::CoordinatorClient;
 use sightline_proto::{MESSAGE_BYTES_MAX, v1};
+use tokio::time::Instant;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status};
 
@@ -19,8 +21,11 @@ use crate::WorkerError;
 const CONNECT_TIME: Duration = Duration::from_secs(5);
 const CALL_TIME: Duration = Duration::from_secs(20);
 /// First and longest pause between two tries.
-const PAUSE_MIN: Duration = Duration::from_millis(50);
-const PAUSE_MAX: Duration = Duration::from_secs(2);
+const PAUSE_MS: u64 = 100;
+const PAUSE_MS_MAX: u64 = 5_000;
+
+/// How to get from an address to a connection; for tests in which the network is simulated.
+pub type Dial = std::sync::Arc<dyn Fn(&Endpoint) -> Channel + Send + Sync>;
 
 /// A client of the coordinator.
 pub(crate) type Client = CoordinatorClient<Channel>;
@@ -74,15 +79,19 @@ pub(crate) struct Connection {
     newest: Option<(String, u64)>,
 }
 
-/// Growing pauses until the patience is over.
+/// Growing pauses until the patience is over. Those of different workers differ, so that a thousand do not
+/// come back to a new coordinator at once.
 struct Pauses {
     start: Instant,
-    pause: Duration,
+    tries: u32,
+    of: u64,
 }
 
 impl Pauses {
-    fn new() -> Self {
-        Self { start: Instant::now(), pause: PAUSE_MIN }
+    fn new(name: &str) -> Self {
+        // Names differ where workers are started by name; the process tells others apart.
+        let of = BuildHasherDefault::<DefaultHasher>::new().hash_one((name, std::process::id()));
+        Self { start: Instant::now(), tries: 0, of }
     }
 
     /// Waits; false when the time is up.
@@ -90,8 +99,9 @@ impl Pauses {
         if self.start.elapsed() >= patience {
             return false;
         }
-        tokio::time::sleep(self.pause).await;
-        self.pause = (self.pause * 2).min(PAUSE_MAX);
+        let pause = pause_ms(PAUSE_MS, PAUSE_MS_MAX, self.tries, self.of);
+        self.tries += 1;
+        tokio::time::sleep(Duration::from_millis(pause)).await;
         true
     }
 }
@@ -103,6 +113,7 @@ impl Connection {
         name: &str,
         threads: usize,
         patience: Duration,
+        dial: Option<&Dial>,
     ) -> Result<Self, WorkerError> {
         let bad = |problem: String| WorkerError::BadUrl { url: url.to_owned(), problem };
         let endpoint = Endpoint::from_shared(url.to_owned())
@@ -112,7 +123,8 @@ impl Connection {
         if endpoint.uri().scheme_str() != Some("http") {
             return Err(bad("it does not start with http://".into()));
         }
-        let client = CoordinatorClient::new(endpoint.connect_lazy())
+        let channel = dial.map_or_else(|| endpoint.connect_lazy(), |dial| dial(&endpoint));
+        let client = CoordinatorClient::new(channel)
             .max_decoding_message_size(MESSAGE_BYTES_MAX)
             .max_encoding_message_size(MESSAGE_BYTES_MAX);
         Ok(Self {
@@ -127,7 +139,7 @@ impl Connection {
 
     /// Registers, trying for as long as the patience lasts.
     pub async fn register(&mut self) -> Result<Session, WorkerError> {
-        let mut pauses = Pauses::new();
+        let mut pauses = Pauses::new(&self.name);
         loop {
             let problem = match self.try_register().await {
                 Ok(session) => return Ok(session),
@@ -189,7 +201,7 @@ impl Connection {
         &self,
         mut call: impl AsyncFnMut(Client) -> Result<T, Status>,
     ) -> Result<Result<T, CallError>, WorkerError> {
-        let mut pauses = Pauses::new();
+        let mut pauses = Pauses::new(&self.name);
         loop {
             match call(self.client.clone()).await.map_err(CallError::from) {
                 Err(CallError::TryAgain(problem)) => {

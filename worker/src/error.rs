@@ -90,13 +90,19 @@ pub enum WorkerError {
 
 /// Why an attempt at a task failed.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum AttemptError {
+#[non_exhaustive]
+pub enum AttemptError {
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
     /// A commit or part of another task cannot be used.
     #[error("`{key}` cannot be used: {problem}")]
-    Input { key: String, problem: String },
+    Input {
+        /// Key of the object.
+        key: String,
+        /// What is wrong with it.
+        problem: String,
+    },
     /// The computation panicked.
     #[error("the computation failed: {0}")]
     Panic(String),
@@ -107,6 +113,7 @@ pub(crate) enum AttemptError {
 
 impl AttemptError {
     /// What the coordinator is to do. One table, so that nobody matches on strings.
+    #[must_use]
     pub const fn class(&self) -> FailureClass {
         match self {
             Self::Store(error) => match error.class() {

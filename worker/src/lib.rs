@@ -1,6 +1,7 @@
 //! The worker: leases tasks, solves them, writes the results.
 //!
 //! - [`Worker`]: registers with a coordinator, works until the bake is over.
+//! - [`compute`]: where the computation of a task runs.
 //! - [`solve`]: what a task computes; a pure function of scene, plan and the rows it reads.
 //!
 //! Solving runs on a thread pool of its own, never on the runtime that talks to the coordinator,
@@ -10,6 +11,7 @@
 mod attempt;
 mod cache;
 mod cell;
+pub mod compute;
 mod connection;
 mod error;
 mod join;
@@ -18,5 +20,6 @@ pub mod solve;
 mod weights;
 mod worker;
 
-pub use error::WorkerError;
+pub use connection::Dial;
+pub use error::{AttemptError, WorkerError};
 pub use worker::{Worker, WorkerOptions, WorkerSummary};

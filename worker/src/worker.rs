@@ -19,11 +19,13 @@ use sightline_jobs::{FailureClass, Plan, TaskId};
 use sightline_proto::{decode_plan, v1};
 use sightline_scene::{OpenOptions, Scene};
 use sightline_store::{BakeStore, keys};
+use tokio::sync::watch;
 use tonic::Request;
 
 use crate::WorkerError;
 use crate::attempt::Bake;
-use crate::connection::{CallError, Client, Connection, Session};
+use crate::compute::Compute;
+use crate::connection::{CallError, Client, Connection, Dial, Session};
 use crate::error::AttemptError;
 use crate::pool::{Cancel, SolvePool};
 
@@ -47,6 +49,12 @@ pub struct WorkerOptions {
     pub name: String,
     /// How long to look for a coordinator that does not answer.
     pub patience: Duration,
+    /// How long the task at hand may still take when the worker is asked to stop.
+    pub drain: Duration,
+    /// Where tasks are computed; on threads of this process when `None`.
+    pub compute: Option<Arc<dyn Compute>>,
+    /// How to connect to the coordinator; by TCP when `None`.
+    pub dial: Option<Dial>,
 }
 
 impl WorkerOptions {
@@ -61,6 +69,9 @@ impl WorkerOptions {
             threads: 0,
             name: "worker".into(),
             patience: Duration::from_secs(60),
+            drain: Duration::ZERO,
+            compute: None,
+            dial: None,
         }
     }
 }
@@ -84,8 +95,9 @@ pub struct WorkerSummary {
 pub struct Worker;
 
 impl Worker {
-    /// Works until the bake is over or `stop` resolves. On `stop`, the current task is given up
-    /// and its lease goes back at once.
+    /// Works until the bake is over or `stop` resolves. Then no task is leased any more, and the one at
+    /// hand has [`WorkerOptions::drain`] to end; behind that it is given up and its lease goes back at
+    /// once.
     ///
     /// # Errors
     /// When the coordinator cannot be reached for too long or refuses this worker, or the store,
@@ -95,16 +107,32 @@ impl Worker {
         stop: impl Future<Output = ()> + Send,
     ) -> Result<WorkerSummary, WorkerError> {
         let pool = SolvePool::new(options.threads)?;
-        let connection =
-            Connection::new(&options.coordinator, &options.name, pool.threads(), options.patience)?;
-        let mut life =
-            Life { options, pool, connection, session: None, summary: WorkerSummary::default() };
-        let ended = tokio::select! {
-            ended = life.work() => Some(ended),
-            () = stop => None,
+        let WorkerOptions { patience, drain, dial, .. } = &options;
+        let (url, name, drain) = (&options.coordinator, &options.name, *drain);
+        let connection = Connection::new(url, name, pool.threads(), *patience, dial.as_ref())?;
+        let (stopping, stopped) = watch::channel(false);
+        let mut life = Life {
+            options,
+            pool,
+            connection,
+            stopped,
+            session: None,
+            summary: WorkerSummary::default(),
+            is_over: false,
+        };
+        let mut stop = std::pin::pin!(stop);
+        let ended = {
+            let mut work = std::pin::pin!(life.work());
+            tokio::select! {
+                ended = &mut work => Some(ended),
+                () = &mut stop => {
+                    stopping.send_replace(true);
+                    tokio::time::timeout(drain, work).await.ok()
+                }
+            }
         };
         // Who was told that the bake is over has been let go already.
-        if !matches!(ended, Some(Ok(()))) {
+        if !life.is_over {
             life.goodbye().await;
         }
         ended.unwrap_or(Ok(())).map(|()| life.summary)
@@ -116,8 +144,12 @@ struct Life {
     options: WorkerOptions,
     pool: SolvePool,
     connection: Connection,
+    /// True when the worker was asked to stop.
+    stopped: watch::Receiver<bool>,
     session: Option<Session>,
     summary: WorkerSummary,
+    /// True when the coordinator has said that the bake is over.
+    is_over: bool,
 }
 
 /// A task that was leased.
@@ -128,21 +160,30 @@ struct Leased {
 }
 
 impl Life {
-    /// Until the bake is over.
+    /// Until the bake is over, or the worker was asked to stop and has no task at hand.
     async fn work(&mut self) -> Result<(), WorkerError> {
         let mut bake: Option<Arc<Bake>> = None;
         loop {
-            let session = self.connection.register().await?;
-            tracing::info!(bake = session.bake_id, epoch = session.epoch, "registered");
-            self.session = Some(session.clone());
-            let opened = match bake.take() {
-                Some(bake) if bake.plan.bake_id == session.bake_id => bake,
-                _ => self.open_alive(&session).await?,
+            let mut stopped = self.stopped.clone();
+            let opened = tokio::select! {
+                opened = self.begin(bake.take()) => opened?,
+                () = asked_to_stop(&mut stopped) => return Ok(()),
             };
-            if self.serve(&session, &opened).await? {
+            if self.serve(&opened).await? {
                 return Ok(());
             }
             bake = Some(opened);
+        }
+    }
+
+    /// Registers, and opens the bake unless it is the one at hand.
+    async fn begin(&mut self, at_hand: Option<Arc<Bake>>) -> Result<Arc<Bake>, WorkerError> {
+        let session = self.connection.register().await?;
+        tracing::info!(bake = session.bake_id, epoch = session.epoch, "registered");
+        self.session = Some(session.clone());
+        match at_hand {
+            Some(bake) if bake.plan.bake_id == session.bake_id => Ok(bake),
+            _ => self.open_alive(&session).await,
         }
     }
 
@@ -164,7 +205,9 @@ impl Life {
         let plan = decode_plan(&bytes)
             .map_err(|source| WorkerError::Plan { bake_id: session.bake_id.clone(), source })?;
         let scene = self.open_scene(session, &plan).await?;
-        Ok(Arc::new(Bake::new(store, plan, scene, self.pool.clone())))
+        let pool: Arc<dyn Compute> = Arc::new(self.pool.clone());
+        let compute = self.options.compute.clone().unwrap_or(pool);
+        Ok(Arc::new(Bake::new(store, plan, scene, compute)))
     }
 
     async fn open_scene(&self, session: &Session, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
@@ -205,12 +248,21 @@ impl Life {
         Ok(Arc::new(scene))
     }
 
-    /// Leases and attempts tasks. True when the bake is over, false when registering is needed.
-    async fn serve(&mut self, session: &Session, bake: &Arc<Bake>) -> Result<bool, WorkerError> {
+    /// Leases and attempts tasks. True when there is nothing more to do, false when registering is
+    /// needed.
+    async fn serve(&mut self, bake: &Arc<Bake>) -> Result<bool, WorkerError> {
+        let session = self.session.clone().ok_or_else(not_registered)?;
+        let mut stopped = self.stopped.clone();
         loop {
             let request = v1::LeaseRequest { worker_id: session.worker, epoch: session.epoch };
-            let answer =
-                self.connection.call(async |mut client| client.lease(request).await).await?;
+            // A lease whose answer is not waited for goes back with the goodbye.
+            let answer = tokio::select! {
+                biased;
+                () = asked_to_stop(&mut stopped) => return Ok(true),
+                answer = self.connection.call(async |mut client| client.lease(request).await) => {
+                    answer?
+                }
+            };
             let answer = match answer {
                 Ok(answer) => answer.into_inner().answer,
                 Err(error) => return again_or_refused(error),
@@ -222,7 +274,7 @@ impl Life {
                         lease: task.lease_id,
                         attempt: task.attempt,
                     };
-                    if !self.attempt(session, bake, &leased).await? {
+                    if !self.attempt(&session, bake, &leased).await? {
                         return Ok(false);
                     }
                 }
@@ -233,6 +285,7 @@ impl Life {
                     tracing::info!(message = finished.message, "the bake is over");
                     self.summary.published = finished.published;
                     self.summary.message = finished.message;
+                    self.is_over = true;
                     return Ok(true);
                 }
                 None => return Err(WorkerError::Refused("a LeaseResponse has no answer".into())),
@@ -311,6 +364,18 @@ impl Life {
             tracing::debug!(%status, "the goodbye was not heard");
         }
     }
+}
+
+/// Until the worker is asked to stop.
+async fn asked_to_stop(stopped: &mut watch::Receiver<bool>) {
+    if stopped.wait_for(|stopped| *stopped).await.is_err() {
+        // The sender lives as long as the worker.
+        std::future::pending::<()>().await;
+    }
+}
+
+fn not_registered() -> WorkerError {
+    WorkerError::Defect("it asks for tasks before it is registered".into())
 }
 
 struct CancelOnDrop(Cancel);

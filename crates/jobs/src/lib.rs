@@ -20,6 +20,6 @@ pub use plan::{
 };
 pub use schedule::{
     FailureClass, Lease, LeaseId, Missing, Outcome, Progress, SchedulePolicy, Scheduler, TaskState,
-    WorkerId,
+    WorkerId, pause_ms,
 };
 pub use status::{BakeStatus, Done, Phase, QuarantinedTask, WorkerStatus};

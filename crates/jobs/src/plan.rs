@@ -161,6 +161,19 @@ pub enum TaskKind {
 }
 
 impl TaskKind {
+    /// Number of kinds.
+    pub const KINDS: usize = 3;
+
+    /// Number of the kind, below [`TaskKind::KINDS`].
+    #[must_use]
+    pub const fn index(&self) -> usize {
+        match self {
+            Self::Segments { .. } => 0,
+            Self::Cells { .. } => 1,
+            Self::Join { .. } => 2,
+        }
+    }
+
     /// Number of segments or cells. Each counts once a task, whatever the number of states: most of
     /// what is solved in a state is what was solved in the one before.
     #[must_use]
