@@ -9,13 +9,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::Stream;
-use sightline_jobs::{BakeStatus, Outcome, Phase, Plan, SchedulePolicy};
+use sightline_jobs::{BakeStatus, Outcome, Phase, Plan, SchedulePolicy, pause_ms};
 use sightline_proto::v1::coordinator_server::CoordinatorServer;
 use sightline_proto::{MESSAGE_BYTES_MAX, v1};
 use sightline_store::BakeStore;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::{Notify, oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::transport::server::Connected;
@@ -31,6 +31,12 @@ use crate::state::State;
 const TICK_MS: u64 = 100;
 /// How long calls in flight may take at the end.
 const DRAIN_TIME: Duration = Duration::from_secs(2);
+/// First and longest pause while the store does not answer, ms.
+const OUTAGE_PAUSE_MS: u64 = 200;
+const OUTAGE_PAUSE_MS_MAX: u64 = 10_000;
+/// How often an idle connection is asked whether its other end still lives, and how long that may take
+/// to answer. A machine that loses its power closes no connection.
+const KEEPALIVE: Duration = Duration::from_secs(10);
 /// Time between two looks for a newer epoch in the store, ms.
 const EPOCH_CHECK_MS: u64 = 5_000;
 
@@ -52,6 +58,8 @@ pub struct CoordinatorOptions {
     pub linger: Duration,
     /// The clock that leases are measured with.
     pub clock: Arc<dyn Clock>,
+    /// How long to go on while the store does not answer.
+    pub patience: Duration,
     /// Tells coordinators that race for an epoch apart: no two may have the same.
     pub name: String,
 }
@@ -74,6 +82,7 @@ impl CoordinatorOptions {
             worker_wait: None,
             linger: Duration::from_secs(5),
             clock: Arc::new(MonotonicClock::default()),
+            patience: Duration::from_secs(300),
             name: unique_name(),
         }
     }
@@ -177,7 +186,13 @@ impl Coordinator {
     where
         IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
     {
-        let (shared, status) = open_bake(&options, addr).await?;
+        let mut outage = Outage::new(options.patience);
+        let (shared, status) = loop {
+            match open_bake(&options, addr).await {
+                Ok(opened) => break opened,
+                Err(error) => outage.wait_out(error).await?,
+            }
+        };
         let (stop, stopped) = oneshot::channel();
         let (stop_server, server_stopped) = oneshot::channel();
         let server = tokio::spawn(serve(incoming, Arc::clone(&shared), server_stopped));
@@ -226,7 +241,7 @@ async fn open_bake(
         journal,
         clock: Arc::clone(clock),
         status,
-        changes: watch::channel(0).0,
+        changes: Notify::new(),
         store_location: absolute(store.location()),
         scene_uri: absolute(&plan.scene.uri),
         lease_ms: policy.lease_ms,
@@ -271,6 +286,8 @@ where
         .max_encoding_message_size(MESSAGE_BYTES_MAX);
     let (draining, drain) = oneshot::channel();
     let server = tonic::transport::Server::builder()
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .http2_keepalive_timeout(Some(KEEPALIVE))
         .add_service(health_service)
         .add_service(reflection)
         .add_service(service)
@@ -288,8 +305,39 @@ where
         }
     };
     tokio::select! {
+        biased;
         served = server => Ok(served?),
         () = drained => Ok(()),
+    }
+}
+
+/// A store that does not answer, and for how long.
+struct Outage {
+    patience: Duration,
+    since: Option<tokio::time::Instant>,
+    tries: u32,
+}
+
+impl Outage {
+    const fn new(patience: Duration) -> Self {
+        Self { patience, since: None, tries: 0 }
+    }
+
+    fn is_over(&mut self) {
+        (self.since, self.tries) = (None, 0);
+    }
+
+    /// Waits before another try, when the error is one that passes and there is patience left.
+    async fn wait_out(&mut self, error: CoordinatorError) -> Result<(), CoordinatorError> {
+        let since = *self.since.get_or_insert_with(tokio::time::Instant::now);
+        if !error.passes() || since.elapsed() > self.patience {
+            return Err(error);
+        }
+        let pause = pause_ms(OUTAGE_PAUSE_MS, OUTAGE_PAUSE_MS_MAX, self.tries, 0);
+        tracing::warn!(%error, pause_ms = pause, "the store does not answer; trying again");
+        self.tries += 1;
+        tokio::time::sleep(Duration::from_millis(pause)).await;
+        Ok(())
     }
 }
 
@@ -306,6 +354,7 @@ impl Run {
     async fn drive(mut self, stopped: oneshot::Receiver<()>) -> Result<Summary, CoordinatorError> {
         let shared = Arc::clone(&self.shared);
         let end = tokio::select! {
+            biased;
             end = self.solve_and_publish() => end,
             _ = stopped => Err(CoordinatorError::Stopped),
         };
@@ -330,8 +379,22 @@ impl Run {
         Ok(Summary { manifest: published.number, changed: published.changed, status })
     }
 
+    /// An outage of the store is waited out: nothing is lost by it but time.
     async fn solve_and_publish(&mut self) -> Result<sightline_store::Published, CoordinatorError> {
-        self.solve().await?;
+        let mut outage = Outage::new(self.options.patience);
+        while let Err(error) = self.solve(&mut outage).await {
+            outage.wait_out(error).await?;
+        }
+        let mut outage = Outage::new(self.options.patience);
+        loop {
+            match self.publish().await {
+                Ok(published) => return Ok(published),
+                Err(error) => outage.wait_out(error).await?,
+            }
+        }
+    }
+
+    async fn publish(&mut self) -> Result<sightline_store::Published, CoordinatorError> {
         self.shared.change(|state, now_ms| state.enter(Phase::Merging, now_ms));
         self.shared.send_status();
         tracing::info!("all tasks are committed; the dataset is put together");
@@ -340,6 +403,7 @@ impl Run {
         loop {
             // The state is looked after meanwhile: workers are waiting.
             tokio::select! {
+                biased;
                 published = &mut publish => return published,
                 () = tokio::time::sleep(Duration::from_millis(TICK_MS)) => {
                     self.shared.state().tick(self.shared.clock.now_ms());
@@ -350,12 +414,14 @@ impl Run {
     }
 
     /// Until every task is committed.
-    async fn solve(&mut self) -> Result<(), CoordinatorError> {
-        let mut changes = self.shared.changes.subscribe();
+    async fn solve(&mut self, outage: &mut Outage) -> Result<(), CoordinatorError> {
+        let shared = Arc::clone(&self.shared);
         loop {
-            changes.mark_unchanged();
+            let mut changed = std::pin::pin!(shared.changes.notified());
+            changed.as_mut().enable();
             self.end_lost_leases().await?;
             self.check_epoch().await?;
+            outage.is_over();
             self.shared.send_status();
             match self.shared.state().outcome() {
                 Outcome::Complete => return Ok(()),
@@ -365,7 +431,7 @@ impl Run {
             self.check_workers()?;
             // At most one look a tick, and at once when the last was longer ago.
             tokio::time::sleep(Duration::from_millis(TICK_MS / 5)).await;
-            let _ = tokio::time::timeout(Duration::from_millis(TICK_MS), changes.changed()).await;
+            let _ = tokio::time::timeout(Duration::from_millis(TICK_MS), changed).await;
         }
     }
 

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 
 use sightline_jobs::{Missing, TaskId};
 use sightline_proto::ConvertError;
-use sightline_store::StoreError;
+use sightline_store::{ErrorClass, StoreError};
 
 /// Why a coordinator ended without a dataset.
 #[derive(Debug, thiserror::Error)]
@@ -72,6 +72,14 @@ pub enum CoordinatorError {
     /// A task of the coordinator itself failed: a defect of the program.
     #[error("the coordinator failed: {0}. Please report this")]
     Defect(String),
+}
+
+impl CoordinatorError {
+    /// True when the same may succeed a little later.
+    #[must_use]
+    pub const fn passes(&self) -> bool {
+        matches!(self, Self::Store(error) if matches!(error.class(), ErrorClass::RetryLater))
+    }
 }
 
 impl From<ConvertError> for CoordinatorError {

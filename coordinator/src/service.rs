@@ -8,7 +8,7 @@ use std::time::Duration;
 use futures::stream;
 use sightline_jobs::{BakeStatus, FORMAT_VERSION, FailureClass, Lease, LeaseId, TaskId, WorkerId};
 use sightline_proto::v1::{self, coordinator_server, lease_response::Answer, report_request};
-use tokio::sync::watch;
+use tokio::sync::{Notify, watch};
 use tonic::{Request, Response, Status};
 
 use crate::clock::Clock;
@@ -28,8 +28,9 @@ pub(crate) struct Shared {
     pub clock: Arc<dyn Clock>,
     /// The status, sent by the coordinator's loop.
     pub status: watch::Sender<BakeStatus>,
-    /// Counts changes of the state: wakes the loop, and lease requests that wait for a task.
-    pub changes: watch::Sender<u64>,
+    /// Wakes the loop, and lease requests that wait for a task, in the order in which they came: a
+    /// `watch` channel would wake them in random order.
+    pub changes: Notify,
     pub store_location: String,
     pub scene_uri: String,
     pub lease_ms: u64,
@@ -47,7 +48,7 @@ impl Shared {
         let mut state = self.state();
         let out = change(&mut state, now_ms);
         drop(state);
-        self.changes.send_modify(|count| *count += 1);
+        self.changes.notify_waiters();
         out
     }
 
@@ -95,7 +96,7 @@ impl Service {
             Answer::Task(v1::LeasedTask { task: lease.task.0, lease_id: lease.id.0, attempt })
         };
         drop(state);
-        self.0.changes.send_modify(|count| *count += 1);
+        self.0.changes.notify_waiters();
         Some(answer)
     }
 
@@ -203,19 +204,21 @@ impl coordinator_server::Coordinator for Service {
         request: Request<v1::LeaseRequest>,
     ) -> Result<Response<v1::LeaseResponse>, Status> {
         let request = request.into_inner();
-        let mut changes = self.0.changes.subscribe();
         let give_up =
             tokio::time::sleep(Duration::from_millis(LEASE_WAIT_MS.min(self.0.lease_ms / 3)));
         tokio::pin!(give_up);
         loop {
             let worker = self.admit(request.epoch, request.worker_id)?;
-            changes.mark_unchanged();
+            // A change between the look and the wait is not missed.
+            let mut changed = std::pin::pin!(self.0.changes.notified());
+            changed.as_mut().enable();
             if let Some(answer) = self.try_lease(worker) {
                 return Ok(Response::new(v1::LeaseResponse { answer: Some(answer) }));
             }
             let gave_up = tokio::select! {
+                biased;
                 () = &mut give_up => true,
-                changed = changes.changed() => changed.is_err(),
+                () = changed => false,
             };
             if gave_up {
                 let answer = Some(Answer::Wait(v1::Wait { retry_after_ms: 10 }));

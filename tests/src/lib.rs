@@ -8,5 +8,6 @@ pub mod dataset;
 pub mod process;
 pub mod requirement;
 pub mod scenes;
+pub mod simulation;
 pub mod sources;
 pub mod workspace;

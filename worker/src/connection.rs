@@ -20,6 +20,9 @@ use crate::WorkerError;
 /// Longest a connection may take, and a call: a lease request waits for a second at most.
 const CONNECT_TIME: Duration = Duration::from_secs(5);
 const CALL_TIME: Duration = Duration::from_secs(20);
+/// How often a silent connection is asked whether its other end still lives, and how long that may take
+/// to answer. A machine that loses its power closes no connection.
+const KEEPALIVE: Duration = Duration::from_secs(10);
 /// First and longest pause between two tries.
 const PAUSE_MS: u64 = 100;
 const PAUSE_MS_MAX: u64 = 5_000;
@@ -81,21 +84,21 @@ pub(crate) struct Connection {
 
 /// Growing pauses until the patience is over. Those of different workers differ, so that a thousand do not
 /// come back to a new coordinator at once.
-struct Pauses {
+pub(crate) struct Pauses {
     start: Instant,
     tries: u32,
     of: u64,
 }
 
 impl Pauses {
-    fn new(name: &str) -> Self {
-        // Names differ where workers are started by name; the process tells others apart.
-        let of = BuildHasherDefault::<DefaultHasher>::new().hash_one((name, std::process::id()));
+    pub fn new(name: &str) -> Self {
+        // Not the process: a simulation has to be repeatable.
+        let of = BuildHasherDefault::<DefaultHasher>::new().hash_one(name);
         Self { start: Instant::now(), tries: 0, of }
     }
 
     /// Waits; false when the time is up.
-    async fn wait(&mut self, patience: Duration) -> bool {
+    pub async fn wait(&mut self, patience: Duration) -> bool {
         if self.start.elapsed() >= patience {
             return false;
         }
@@ -119,7 +122,10 @@ impl Connection {
         let endpoint = Endpoint::from_shared(url.to_owned())
             .map_err(|error| bad(error.to_string()))?
             .connect_timeout(CONNECT_TIME)
-            .timeout(CALL_TIME);
+            .timeout(CALL_TIME)
+            .http2_keep_alive_interval(KEEPALIVE)
+            .keep_alive_timeout(KEEPALIVE)
+            .keep_alive_while_idle(true);
         if endpoint.uri().scheme_str() != Some("http") {
             return Err(bad("it does not start with http://".into()));
         }

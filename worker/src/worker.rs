@@ -18,14 +18,14 @@ use std::time::Duration;
 use sightline_jobs::{FailureClass, Plan, TaskId};
 use sightline_proto::{decode_plan, v1};
 use sightline_scene::{OpenOptions, Scene};
-use sightline_store::{BakeStore, keys};
+use sightline_store::{BakeStore, ErrorClass, keys};
 use tokio::sync::watch;
 use tonic::Request;
 
 use crate::WorkerError;
 use crate::attempt::Bake;
 use crate::compute::Compute;
-use crate::connection::{CallError, Client, Connection, Dial, Session};
+use crate::connection::{CallError, Client, Connection, Dial, Pauses, Session};
 use crate::error::AttemptError;
 use crate::pool::{Cancel, SolvePool};
 
@@ -124,6 +124,7 @@ impl Worker {
         let ended = {
             let mut work = std::pin::pin!(life.work());
             tokio::select! {
+                biased;
                 ended = &mut work => Some(ended),
                 () = &mut stop => {
                     stopping.send_replace(true);
@@ -166,6 +167,7 @@ impl Life {
         loop {
             let mut stopped = self.stopped.clone();
             let opened = tokio::select! {
+                biased;
                 opened = self.begin(bake.take()) => opened?,
                 () = asked_to_stop(&mut stopped) => return Ok(()),
             };
@@ -191,12 +193,29 @@ impl Life {
     async fn open_alive(&self, session: &Session) -> Result<Arc<Bake>, WorkerError> {
         let alive = heartbeats(self.connection.client.clone(), session.clone(), None, None);
         tokio::select! {
+            biased;
             opened = self.open(session) => opened,
             never = alive => match never {},
         }
     }
 
+    /// Opens a bake; an outage of the store is waited out for as long as the patience lasts.
     async fn open(&self, session: &Session) -> Result<Arc<Bake>, WorkerError> {
+        let mut pauses = Pauses::new(&self.options.name);
+        loop {
+            match self.try_open(session).await {
+                Err(WorkerError::Store(error)) if error.class() == ErrorClass::RetryLater => {
+                    tracing::warn!(%error, "the store does not answer; trying again");
+                    if !pauses.wait(self.options.patience).await {
+                        return Err(error.into());
+                    }
+                }
+                opened => return opened,
+            }
+        }
+    }
+
+    async fn try_open(&self, session: &Session) -> Result<Arc<Bake>, WorkerError> {
         let store = match &self.options.store {
             Some(store) => store.clone(),
             None => BakeStore::open(&session.store_location)?,
@@ -313,6 +332,7 @@ impl Life {
             Some(lost.clone()),
         );
         let outcome = tokio::select! {
+            biased;
             outcome = bake.attempt(leased.task, &leased.attempt, &lost) => outcome,
             never = alive => match never {},
         };
