@@ -1,6 +1,7 @@
 //! The worker: leases tasks, solves them, writes the results.
 //!
 //! - [`Worker`]: registers with a coordinator, works until the bake is over.
+//! - [`scene_files`]: the scene on a machine that may not have it.
 //! - [`solve`]: what a task computes; a pure function of scene, plan and the rows it reads.
 //!
 //! Solving runs on a thread pool of its own, never on the runtime that talks to the coordinator,
@@ -14,9 +15,11 @@ mod connection;
 mod error;
 mod join;
 mod pool;
+pub mod scene_files;
 pub mod solve;
 mod weights;
 mod worker;
 
 pub use error::WorkerError;
+pub use scene_files::{SceneAccess, SceneOnDisk};
 pub use worker::{Worker, WorkerOptions, WorkerSummary};

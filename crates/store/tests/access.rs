@@ -73,7 +73,7 @@ async fn a_folder_in_a_store_keeps_the_promises() {
 
 #[test]
 fn unknown_schemes_are_the_users_to_fix() {
-    for location in ["s3://bucket/x", "https://example.com/x", "nonsense://x", "://"] {
+    for location in ["https://example.com/x", "nonsense://x", "://"] {
         let error = BakeStore::open(location).unwrap_err();
         assert_eq!(error.class(), ErrorClass::FixInput, "{error}");
     }
