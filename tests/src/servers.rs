@@ -51,12 +51,12 @@ pub fn moto(test: &str) -> Option<Server> {
     let python = requirement::python_with("moto.server");
     let install = "`.venv` with the packages of tests/object-stores/requirements.txt";
     let python = requirement::program(test, python, install)?;
-    let server = start("s3", |port, _| {
+    let script = workspace::root().join("tests/object-stores/serve_moto.py");
+    let mut server = start("s3", |port, _| {
         let mut command = Command::new(&python);
-        command.args(["-m", "moto.server", "-H", "127.0.0.1", "-p", &port.to_string()]);
+        command.arg(&script).arg(port.to_string());
         command
     });
-    let mut server = server;
     server.environment = s3_environment(server.port);
     server.run(Command::new(python).args(["-c", CREATE_BUCKET, &server.port.to_string()]));
     Some(server)
