@@ -3,6 +3,7 @@
 //! - [`prepare()`]: from a scene file and a configuration to a plan.
 //! - [`Coordinator`]: runs a plan to its end, over gRPC.
 //! - [`journal`]: what is in the store, who may write it, and what a crash leaves behind.
+//! - [`scene_files`]: scenes from object stores, and copies for workers.
 //! - [`dataset`]: from committed parts to a published dataset.
 //!
 //! The same library runs embedded in `sightline bake`, with a worker in the same process, and
@@ -15,10 +16,12 @@ pub mod dataset;
 mod error;
 pub mod journal;
 pub mod prepare;
+pub mod scene_files;
 mod service;
 mod state;
 
 pub use coordinator::{Coordinator, CoordinatorHandle, CoordinatorOptions, Summary};
 pub use dataset::{DatasetPublisher, Publish};
 pub use error::CoordinatorError;
-pub use prepare::{PrepareError, Prepared, prepare};
+pub use prepare::{PrepareError, Prepared, prepare, prepare_from};
+pub use scene_files::{SceneFilesError, ShareScene, fetch_scene, share_scene};

@@ -7,16 +7,19 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Parser;
-use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared, Summary, prepare};
+use sightline_coordinator::{
+    Coordinator, CoordinatorOptions, Prepared, ShareScene, Summary, fetch_scene, prepare_from,
+    share_scene,
+};
 use sightline_jobs::BakeConfig;
-use sightline_store::BakeStore;
+use sightline_store::{BakeStore, ByteSize, FileCache, local_path};
 
 /// Plans a bake, leases its tasks to workers, publishes the dataset.
 #[derive(Debug, Parser)]
 #[command(version, after_help = "Stop it at any time; the same command goes on with the bake.")]
 struct Arguments {
-    /// The scene, a .gltf or .glb file.
-    scene: PathBuf,
+    /// The scene: a .gltf or .glb file or a particle table, or its URL in an object store.
+    scene: String,
     /// Where the dataset goes: a folder or an object store URL.
     #[arg(long, value_name = "LOCATION")]
     out: String,
@@ -35,6 +38,16 @@ struct Arguments {
     /// Give up after this time without any worker, s. Without it, wait for ever.
     #[arg(long, value_name = "SECONDS")]
     worker_wait: Option<u64>,
+    /// Put copies of the scene's files into the store, for workers that do not see this machine's disk:
+    /// always, never, or when the store is an object store (auto).
+    #[arg(long, value_name = "WHEN", default_value = "auto", env = "SIGHTLINE_SHARE_SCENE")]
+    share_scene: ShareScene,
+    /// Folder for copies of a scene from an object store.
+    #[arg(long, value_name = "DIR", env = "SIGHTLINE_CACHE")]
+    cache: Option<PathBuf>,
+    /// Limit of that folder, such as 20GiB or 500MB.
+    #[arg(long, value_name = "SIZE", default_value = "20GiB", env = "SIGHTLINE_CACHE_SIZE")]
+    cache_size: ByteSize,
 }
 
 type Error = Box<dyn std::error::Error + Send + Sync>;
@@ -73,9 +86,24 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
         .collect::<Result<Vec<_>, _>>()?;
     let config = BakeConfig::from_toml_with(&text, &overrides)?;
     let store = BakeStore::open_or_create(&arguments.out)?;
-    let scene = arguments.scene.clone();
+    let (scene, fetched) = match local_path(&arguments.scene) {
+        Some(path) => (path, None),
+        None => {
+            let folder = arguments.cache.unwrap_or_else(FileCache::default_folder);
+            let cache = FileCache::open(&folder, arguments.cache_size.0)?;
+            let fetched = fetch_scene(&arguments.scene, &config.scene.particles, &cache).await?;
+            (fetched.path, Some(fetched.view))
+        }
+    };
+    let uri = match &fetched {
+        Some(_) => arguments.scene.clone(),
+        None => scene.display().to_string(),
+    };
+    let path = scene.clone();
     let Prepared { plan, publisher, scene: _ } =
-        tokio::task::spawn_blocking(move || prepare(&scene, config)).await??;
+        tokio::task::spawn_blocking(move || prepare_from(&path, &uri, config)).await??;
+    share_scene(&store, &plan.scene, &scene, &plan.config, arguments.share_scene).await?;
+    drop(fetched);
 
     let mut options = CoordinatorOptions::new(arguments.listen, store, plan, Arc::new(publisher));
     options.policy.lease_ms = arguments.lease_ms;

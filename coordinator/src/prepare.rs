@@ -58,9 +58,20 @@ fn describe(skipped: &SkippedCells) -> String {
 /// # Errors
 /// When the configuration, the scene or the region is refused.
 pub fn prepare(path: &Path, config: BakeConfig) -> Result<Prepared, PrepareError> {
+    prepare_from(path, &path.display().to_string(), config)
+}
+
+/// As [`prepare`], of a scene that workers find at `uri`; `path` is where it lies here.
+///
+/// # Errors
+/// As [`prepare`].
+pub fn prepare_from(path: &Path, uri: &str, config: BakeConfig) -> Result<Prepared, PrepareError> {
     config.validate()?;
     let scene = Scene::open(path, &open_options(path, &config))?;
-    prepare_scene(Arc::new(scene), path, config)
+    let mut prepared = prepare_scene(Arc::new(scene), path, config)?;
+    // Where the scene lies is no part of the bake's identity.
+    prepared.plan.scene.uri = sightline_store::redacted(uri);
+    Ok(prepared)
 }
 
 /// How the scene at `path` has to be opened for a bake with this configuration: workers do the same.

@@ -4,10 +4,13 @@
 
 pub mod binaries;
 pub mod city;
+pub mod conformance;
 pub mod dataset;
+pub mod flaky_proxy;
 pub mod process;
 pub mod requirement;
 pub mod scenes;
 pub mod simulation;
+pub mod servers;
 pub mod sources;
 pub mod workspace;

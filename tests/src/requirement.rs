@@ -37,16 +37,28 @@ pub fn program(test: &str, found: Option<PathBuf>, install: &str) -> Option<Path
 /// The Python that `tests/run` prepares, if it has DuckDB.
 #[must_use]
 pub fn python_with_duckdb() -> Option<PathBuf> {
+    python_with("duckdb")
+}
+
+/// The Python that `tests/run` prepares, if it has a module.
+#[must_use]
+pub fn python_with(module: &str) -> Option<PathBuf> {
     let python = workspace::root().join(".venv/bin/python");
-    succeeds(Command::new(&python).args(["-c", "import duckdb"])).then_some(python)
+    succeeds(Command::new(&python).args(["-c", &format!("import {module}")])).then_some(python)
+}
+
+/// Node, if a package has been installed in a folder.
+#[must_use]
+pub fn node_with(package: &std::path::Path) -> Option<PathBuf> {
+    let node = PathBuf::from("node");
+    (package.is_dir() && succeeds(Command::new(&node).arg("--version"))).then_some(node)
 }
 
 /// Node, if the Khronos validator has been installed beside its script.
 #[must_use]
 pub fn node_with_validator() -> Option<PathBuf> {
     let package = workspace::root().join("tests/gltf-validator/node_modules/gltf-validator");
-    let node = PathBuf::from("node");
-    (package.is_dir() && succeeds(Command::new(&node).arg("--version"))).then_some(node)
+    node_with(&package)
 }
 
 fn succeeds(command: &mut Command) -> bool {

@@ -41,6 +41,17 @@ pub enum WorkerError {
     /// The scene is refused.
     #[error(transparent)]
     Scene(#[from] SceneError),
+    /// The scene is neither on this machine nor in the store.
+    #[error(
+        "the scene is not at {place} on this machine, and cannot be fetched: {problem}. Start the \
+         coordinator with --share-scene always, or give this worker the scene with --scene"
+    )]
+    NoScene {
+        /// Where it was looked for.
+        place: String,
+        /// What the store says.
+        problem: String,
+    },
     /// The scene is not the one that is being baked.
     #[error(
         "{path} is not the scene of this bake: its digest is {found}, the bake's is {expected}. \

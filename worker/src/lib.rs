@@ -2,6 +2,7 @@
 //!
 //! - [`Worker`]: registers with a coordinator, works until the bake is over.
 //! - [`compute`]: where the computation of a task runs.
+//! - [`scene_files`]: the scene on a machine that may not have it.
 //! - [`solve`]: what a task computes; a pure function of scene, plan and the rows it reads.
 //!
 //! Solving runs on a thread pool of its own, never on the runtime that talks to the coordinator,
@@ -16,10 +17,12 @@ mod connection;
 mod error;
 mod join;
 mod pool;
+pub mod scene_files;
 pub mod solve;
 mod weights;
 mod worker;
 
 pub use connection::Dial;
 pub use error::{AttemptError, WorkerError};
+pub use scene_files::{SceneAccess, SceneOnDisk};
 pub use worker::{Worker, WorkerOptions, WorkerSummary};

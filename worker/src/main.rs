@@ -5,8 +5,8 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
-use sightline_store::BakeStore;
-use sightline_worker::{Worker, WorkerOptions, WorkerSummary};
+use sightline_store::{BakeStore, ByteSize};
+use sightline_worker::{SceneAccess, Worker, WorkerOptions, WorkerSummary};
 
 /// Leases tasks from a coordinator, solves them, writes the results.
 #[derive(Debug, Parser)]
@@ -15,9 +15,19 @@ struct Arguments {
     /// URL of the coordinator.
     #[arg(default_value = "http://127.0.0.1:7070", env = "SIGHTLINE_COORDINATOR")]
     coordinator: String,
-    /// The scene, where it lies elsewhere than for the coordinator.
+    /// The scene or its URL, where it lies elsewhere than for the coordinator. Where it is not found, it
+    /// is fetched from the store.
     #[arg(long, value_name = "FILE", env = "SIGHTLINE_SCENE")]
     scene: Option<PathBuf>,
+    /// Fetch the scene from the store even when it is found.
+    #[arg(long, env = "SIGHTLINE_FETCH_SCENE")]
+    fetch_scene: bool,
+    /// Folder for copies of a scene that is fetched; any number of workers may share it.
+    #[arg(long, value_name = "DIR", env = "SIGHTLINE_CACHE")]
+    cache: Option<PathBuf>,
+    /// Limit of that folder, such as 20GiB or 500MB.
+    #[arg(long, value_name = "SIZE", default_value = "20GiB", env = "SIGHTLINE_CACHE_SIZE")]
+    cache_size: ByteSize,
     /// The store, where it is elsewhere than for the coordinator.
     #[arg(long, value_name = "LOCATION", env = "SIGHTLINE_STORE")]
     store: Option<String>,
@@ -62,6 +72,11 @@ async fn main() -> ExitCode {
 async fn run(arguments: Arguments) -> Result<WorkerSummary, Error> {
     let mut options = WorkerOptions::new(&arguments.coordinator);
     options.scene_path = arguments.scene;
+    options.scene_access = SceneAccess {
+        fetch: arguments.fetch_scene,
+        cache_folder: arguments.cache,
+        cache_bytes_max: arguments.cache_size.0,
+    };
     options.store = arguments.store.as_deref().map(BakeStore::open).transpose()?;
     options.threads = arguments.threads;
     options.name = arguments.name;

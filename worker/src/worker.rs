@@ -28,6 +28,7 @@ use crate::compute::Compute;
 use crate::connection::{CallError, Client, Connection, Dial, Pauses, Session};
 use crate::error::AttemptError;
 use crate::pool::{Cancel, SolvePool};
+use crate::scene_files::{self, SceneAccess};
 
 /// How long a goodbye may take.
 const GOODBYE_TIME: Duration = Duration::from_secs(1);
@@ -41,6 +42,8 @@ pub struct WorkerOptions {
     pub store: Option<BakeStore>,
     /// Path of the scene; where the coordinator says when `None`.
     pub scene_path: Option<PathBuf>,
+    /// How to get a scene that is not on this machine.
+    pub scene_access: SceneAccess,
     /// The scene, when it is in memory already.
     pub scene: Option<Arc<Scene>>,
     /// Threads to solve with; 0 stands for one a core.
@@ -65,6 +68,7 @@ impl WorkerOptions {
             coordinator: coordinator.to_owned(),
             store: None,
             scene_path: None,
+            scene_access: SceneAccess::default(),
             scene: None,
             threads: 0,
             name: "worker".into(),
@@ -223,18 +227,23 @@ impl Life {
         let bytes = store.get(&keys::plan(&session.bake_id)).await?;
         let plan = decode_plan(&bytes)
             .map_err(|source| WorkerError::Plan { bake_id: session.bake_id.clone(), source })?;
-        let scene = self.open_scene(session, &plan).await?;
+        let scene = self.open_scene(session, &plan, &store).await?;
         let pool: Arc<dyn Compute> = Arc::new(self.pool.clone());
         let compute = self.options.compute.clone().unwrap_or(pool);
         Ok(Arc::new(Bake::new(store, plan, scene, compute)))
     }
 
-    async fn open_scene(&self, session: &Session, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
+    async fn open_scene(
+        &self,
+        session: &Session,
+        plan: &Plan,
+        store: &BakeStore,
+    ) -> Result<Arc<Scene>, WorkerError> {
         let path = self.options.scene_path.clone();
         let path = path.unwrap_or_else(|| PathBuf::from(&session.scene_uri));
         let scene = match &self.options.scene {
             Some(scene) => Arc::clone(scene),
-            None => self.read_scene(&path, plan).await?,
+            None => self.read_scene(&path, plan, store).await?,
         };
         if scene.digest.combined != session.scene_digest {
             return Err(WorkerError::OtherScene {
@@ -251,9 +260,18 @@ impl Life {
         Ok(scene)
     }
 
-    async fn read_scene(&self, path: &Path, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
+    async fn read_scene(
+        &self,
+        path: &Path,
+        plan: &Plan,
+        store: &BakeStore,
+    ) -> Result<Arc<Scene>, WorkerError> {
         // As the coordinator did.
         let asked = &plan.config.scene;
+        let (place, files) = (path.to_string_lossy(), &plan.scene.files);
+        let access = &self.options.scene_access;
+        let found = scene_files::locate(&place, files, &asked.particles, store, access).await?;
+        let path = &found.path;
         let options = OpenOptions::of_bake(
             path,
             &asked.see_through,
@@ -261,7 +279,7 @@ impl Life {
             asked.animation.as_deref(),
             asked.motion_error,
         );
-        let path = path.to_owned();
+        let (options, path) = (found.with_tables(options), path.to_owned());
         let read = self.pool.run(move || Scene::open(&path, &options)).await;
         let scene = read.map_err(|panic| WorkerError::Defect(panic.to_string()))??;
         Ok(Arc::new(scene))

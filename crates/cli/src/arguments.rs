@@ -6,8 +6,10 @@
 use std::path::PathBuf;
 
 use clap::{ArgAction, ArgMatches, Args, Command, FromArgMatches, Parser, Subcommand, ValueEnum};
+use sightline_coordinator::ShareScene;
 use sightline_geometry::CellId;
 use sightline_jobs::{KEYS, KeyDoc};
+use sightline_store::{ByteSize, CACHE_BYTES_MAX};
 
 /// Precomputed visibility for large 3D worlds: which triangles can be seen from where.
 #[derive(Debug, Parser)]
@@ -107,17 +109,39 @@ pub struct Generate {
     pub json: bool,
 }
 
+/// Where copies of scene files from object stores are kept.
+#[derive(Clone, Debug, Args)]
+pub struct CacheFlags {
+    /// Folder for copies of scene files from object stores; any number of processes may share it. In
+    /// the system's folder for caches when absent.
+    #[arg(long, value_name = "DIR", env = "SIGHTLINE_CACHE")]
+    pub cache: Option<PathBuf>,
+    /// Limit of that folder, such as 20GiB or 500MB. What was not used for longest is removed first.
+    #[arg(long, value_name = "SIZE", default_value = "20GiB", env = "SIGHTLINE_CACHE_SIZE")]
+    pub cache_size: ByteSize,
+}
+
+impl Default for CacheFlags {
+    fn default() -> Self {
+        Self { cache: None, cache_size: ByteSize(CACHE_BYTES_MAX) }
+    }
+}
+
 /// Scene, output and configuration of a bake.
 #[derive(Debug, Args)]
 pub struct BakeInput {
-    /// The scene, a .gltf or .glb file.
+    /// The scene: a .gltf or .glb file or a particle table, or its URL in an object store.
     pub scene: PathBuf,
-    /// Folder of the dataset; made when it does not exist. Holds the state of the bake too.
-    #[arg(short, long, value_name = "DIR")]
+    /// Folder of the dataset, or its URL in an object store, such as s3://bucket/prefix; made when it
+    /// does not exist. Holds the state of the bake too. Credentials come from the environment.
+    #[arg(short, long, value_name = "DIR|URL")]
     pub out: String,
     /// Configuration file (TOML). Flags below overrule its keys.
     #[arg(short, long, value_name = "bake.toml")]
     pub config: Option<PathBuf>,
+    /// Copies of the scene, when it comes from an object store.
+    #[command(flatten)]
+    pub cache: CacheFlags,
     /// One flag a key of the configuration.
     #[command(flatten)]
     pub keys: ConfigFlags,
@@ -153,6 +177,10 @@ pub struct Coordinator {
     /// Address and port to listen on.
     #[arg(long, default_value = "127.0.0.1:7070", value_name = "HOST:PORT")]
     pub listen: std::net::SocketAddr,
+    /// Put copies of the scene's files into the store, for workers that do not see this machine's disk:
+    /// always, never, or when the store is an object store (auto).
+    #[arg(long, value_name = "WHEN", default_value = "auto")]
+    pub share_scene: ShareScene,
 }
 
 /// `worker`.
@@ -161,12 +189,19 @@ pub struct Worker {
     /// The coordinator, such as http://127.0.0.1:7070.
     #[arg(long, value_name = "URL")]
     pub coordinator: String,
-    /// The scene on this machine, when it is elsewhere than on the coordinator's.
-    #[arg(long, value_name = "PATH")]
+    /// The scene on this machine or its URL, when it is elsewhere than on the coordinator's. Where it is
+    /// not found, it is fetched from the store.
+    #[arg(long, value_name = "PATH|URL")]
     pub scene: Option<PathBuf>,
-    /// The dataset folder on this machine, when it is elsewhere than on the coordinator's.
-    #[arg(long, value_name = "DIR")]
+    /// Fetch the scene from the store even when it is found.
+    #[arg(long)]
+    pub fetch_scene: bool,
+    /// The dataset folder on this machine or its URL, when it is elsewhere than on the coordinator's.
+    #[arg(long, value_name = "DIR|URL")]
     pub out: Option<String>,
+    /// Copies of a scene that is fetched.
+    #[command(flatten)]
+    pub cache: CacheFlags,
     /// Threads; all cores when absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
@@ -175,12 +210,15 @@ pub struct Worker {
 /// A dataset and its scene.
 #[derive(Debug, Args)]
 pub struct DatasetInput {
-    /// Folder of the dataset.
+    /// Folder of the dataset, or its URL in an object store.
     pub dataset: String,
-    /// The scene that was baked; looked for where it was baked from and beside the dataset when
-    /// absent.
-    #[arg(long, value_name = "PATH")]
+    /// The scene that was baked or its URL; looked for where it was baked from, beside the dataset and
+    /// in the dataset's store when absent.
+    #[arg(long, value_name = "PATH|URL")]
     pub scene: Option<PathBuf>,
+    /// Copies of the scene, when it comes from an object store.
+    #[command(flatten)]
+    pub cache: CacheFlags,
 }
 
 /// `verify`.
@@ -281,8 +319,11 @@ pub struct Export {
 /// `info`.
 #[derive(Debug, Args)]
 pub struct Info {
-    /// A scene file or the folder of a dataset.
+    /// A scene file or the folder of a dataset, or the URL of one.
     pub path: PathBuf,
+    /// Copies of the scene, when it comes from an object store.
+    #[command(flatten)]
+    pub cache: CacheFlags,
     /// Describe this cell of the dataset.
     #[arg(long, value_name = "ID", value_parser = parse_cell)]
     pub cell: Option<CellId>,
@@ -297,7 +338,7 @@ pub struct Info {
 /// `cell`.
 #[derive(Debug, Args)]
 pub struct Cell {
-    /// Folder of the dataset.
+    /// Folder of the dataset, or its URL in an object store.
     pub dataset: String,
     /// The position, world space, metres.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]

@@ -18,7 +18,7 @@
 use std::fmt;
 
 use serde_json::json;
-use sightline_coordinator::{CoordinatorError, PrepareError};
+use sightline_coordinator::{CoordinatorError, PrepareError, SceneFilesError};
 use sightline_jobs::ConfigError;
 use sightline_scene::SceneError;
 use sightline_scene::export::ExportError;
@@ -195,10 +195,17 @@ impl From<StoreError> for Failure {
                 (Kind::Input, "give the folder that `sightline bake --out` wrote")
             }
             (StoreError::BadLocation { .. }, _) => {
-                (Kind::Input, "give the path of a folder that exists and that this user can use")
+                (Kind::Input, "give a folder or a bucket that exists and that this user can use")
             }
             (StoreError::UnsupportedVersion { .. }, _) => {
                 (Kind::Input, "use the version of Sightline that wrote it, or bake again")
+            }
+            (StoreError::Cache { .. }, _) => {
+                (Kind::Store, "--cache and --cache-size say where copies are kept, and how much")
+            }
+            (StoreError::SourceFile { .. }, _) => (Kind::Input, "check the file and try again"),
+            (StoreError::UnsafeStore { .. }, _) => {
+                (Kind::Store, "give another place with --out; nothing was written there")
             }
             (_, ErrorClass::RetryLater) => (Kind::Store, "run the command again"),
             (_, ErrorClass::FixInput) => {
@@ -267,6 +274,16 @@ impl From<PrepareError> for Failure {
     }
 }
 
+impl From<SceneFilesError> for Failure {
+    fn from(error: SceneFilesError) -> Self {
+        match error {
+            SceneFilesError::Store(error) => error.into(),
+            SceneFilesError::Scene(error) => error.into(),
+            _ => Self::new(Kind::Input, error.to_string()),
+        }
+    }
+}
+
 impl From<CoordinatorError> for Failure {
     fn from(error: CoordinatorError) -> Self {
         let text = error.to_string();
@@ -297,7 +314,8 @@ impl From<WorkerError> for Failure {
             WorkerError::BadUrl { .. } | WorkerError::Threads { .. } => {
                 Self::new(Kind::Usage, text)
             }
-            WorkerError::OtherScene { .. }
+            WorkerError::NoScene { .. }
+            | WorkerError::OtherScene { .. }
             | WorkerError::OtherStates { .. }
             | WorkerError::Plan { .. } => Self::new(Kind::Input, text),
             WorkerError::Unreachable { .. } => Self::new(Kind::Network, text),

@@ -52,6 +52,15 @@ impl SceneDigest {
     }
 }
 
+/// The files that the buffers of the glTF file at `path` name, relative to its folder: what a bake reads
+/// of a scene besides the main file and particle tables.
+///
+/// # Errors
+/// When the main file cannot be read or its JSON is invalid.
+pub fn external_buffers(path: &Path) -> Result<Vec<String>, SceneError> {
+    gltf_reader::external_buffers(path).map_err(|e| e.in_file(path))
+}
+
 /// Hashes a scene without reading its geometry; equal to the digest of [`crate::Scene::open`].
 ///
 /// # Errors

@@ -17,7 +17,7 @@ pub mod region;
 mod report;
 mod scene;
 
-pub use digest::{FileDigest, SceneDigest, digest, digest_with};
+pub use digest::{FileDigest, SceneDigest, digest, digest_with, external_buffers};
 pub use error::{Cause, Place, SceneError, UriProblem};
 pub use numbering::morton;
 pub use particles::{ParticleSource, TableProblem};

@@ -63,6 +63,22 @@ pub enum StoreError {
         /// What is wrong with it.
         problem: String,
     },
+    /// A file of this machine, on its way to or from the store, cannot be used.
+    #[error("`{path}` cannot be used: {problem}", path = .path.display())]
+    SourceFile {
+        /// The file.
+        path: std::path::PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The folder that keeps copies of objects cannot be used.
+    #[error("the cache {path} cannot be used: {problem}", path = .path.display())]
+    Cache {
+        /// The folder.
+        path: std::path::PathBuf,
+        /// What is wrong with it, and what to do.
+        problem: String,
+    },
     /// The store does not keep the promise that commits rest on.
     #[error(
         "{location} cannot hold a bake: {problem}. Use a local file system with hard links, or an \
@@ -112,6 +128,8 @@ impl StoreError {
             Self::Corrupt { .. } => ErrorClass::Corrupt,
             Self::Refused { .. }
             | Self::BadLocation { .. }
+            | Self::SourceFile { .. }
+            | Self::Cache { .. }
             | Self::UnsafeStore { .. }
             | Self::NotADataset { .. }
             | Self::UnsupportedVersion { .. }

@@ -8,6 +8,7 @@
 //! bake/<bake>/epochs/00000001       coordinator epochs
 //! bake/<bake>/parts/<task>-<attempt>[-cells|-objects].parquet
 //! bake/<bake>/commits/<task>        finished tasks
+//! bake/scene/<hash>                 a file of a scene, named by its content, for workers to fetch
 //! bake/probe/                       scratch of the start-up probe
 //! ```
 
@@ -19,6 +20,9 @@ pub const MANIFEST_FOLDER: &str = "manifests";
 pub const BAKE_FOLDER: &str = "bake";
 /// Scratch of the start-up probe.
 pub const PROBE_FOLDER: &str = "bake/probe";
+
+/// Folder of the copies of scene files, shared by all bakes.
+pub const SCENE_FOLDER: &str = "bake/scene";
 
 /// What a part file holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,6 +52,12 @@ pub fn manifest_number(key: &str) -> Option<u64> {
 #[must_use]
 pub fn plan(bake: &str) -> String {
     format!("{BAKE_FOLDER}/{bake}/plan.bin")
+}
+
+/// Key of the copy of a scene file with this BLAKE3 hash, hexadecimal.
+#[must_use]
+pub fn scene_file(blake3: &str) -> String {
+    format!("{SCENE_FOLDER}/{blake3}")
 }
 
 /// Folder of a bake's coordinator epochs.

@@ -1,6 +1,7 @@
 //! The visibility dataset: Parquet layout, manifest, commits, reader.
 //!
 //! - [`BakeStore`]: the few object-store operations that everything rests on.
+//! - [`FileCache`]: a folder of limited size with copies of objects, by content.
 //! - [`parts`]: what tasks write while a bake runs.
 //! - [`DatasetWriter`] and [`publish`]: from rows to a published dataset.
 //! - [`Dataset`]: reading it, cell by cell or whole, and [`Dataset::check`].
@@ -17,6 +18,7 @@
 mod access;
 pub mod codec;
 mod error;
+mod file_cache;
 pub mod keys;
 mod manifest;
 pub mod parts;
@@ -28,9 +30,10 @@ mod verify;
 mod weight;
 mod writer;
 
-pub use access::{BakeStore, Created};
+pub use access::{BakeStore, Created, ObjectVersion, is_url, key_beside, local_path, redacted};
 pub use codec::{DecodeError, decode_set, encode_set};
 pub use error::{ErrorClass, Result, StoreError};
+pub use file_cache::{ByteSize, CACHE_BYTES_MAX, CachedFile, FileCache, FileView};
 pub use keys::PartKind;
 pub use manifest::{
     BoxRecord, DataFile, FORMAT, FileKind, Manifest, Pointer, SceneFile, SceneSource, Totals,

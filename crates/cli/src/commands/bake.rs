@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use sightline_coordinator::{
-    Coordinator, CoordinatorHandle, CoordinatorOptions, Prepared, Summary as Ended, prepare,
+    Coordinator, CoordinatorHandle, CoordinatorOptions, Prepared, Summary as Ended, prepare_from,
 };
 use sightline_jobs::{BakeConfig, BakeStatus, Done, Phase, Plan};
 use sightline_scene::SceneDigest;
@@ -66,7 +66,7 @@ pub fn bake(input: &BakeInput, threads: Option<u32>) -> Result<Baked> {
         Ok::<_, Failure>((ended, summary))
     })?;
     phases.finish();
-    Ok(Baked { out: input.out.clone(), plan, ended, summary, phases })
+    Ok(Baked { out: sightline_store::redacted(&input.out), plan, ended, summary, phases })
 }
 
 /// The configuration: the file, overruled by flags.
@@ -85,9 +85,14 @@ pub fn read_config(input: &BakeInput) -> Result<BakeConfig> {
 
 /// Reads the scene and plans the bake, on so many threads.
 pub fn prepare_on(input: &BakeInput, config: BakeConfig, threads: Option<u32>) -> Result<Prepared> {
+    let found = super::scene::locate(&input.scene, &config.scene.particles, &input.cache);
+    let found = super::runtime()?.block_on(found)?;
     // Commands that look for the scene later run in other folders.
-    let scene = absolute(&input.scene);
-    Ok(super::on_threads(threads, || prepare(&scene, config))??)
+    let uri = match super::scene::is_elsewhere(&input.scene) {
+        true => input.scene.to_string_lossy().into_owned(),
+        false => absolute(&found.path).display().to_string(),
+    };
+    Ok(super::on_threads(threads, || prepare_from(&absolute(&found.path), &uri, config))??)
 }
 
 fn absolute(path: &Path) -> PathBuf {
@@ -97,15 +102,15 @@ fn absolute(path: &Path) -> PathBuf {
 /// Opens the output folder, and says what a new bake into it has to do with the last one.
 pub async fn open_store(input: &BakeInput, digest: &SceneDigest, plan: &Plan) -> Result<BakeStore> {
     let store = BakeStore::open_or_create(&input.out).map_err(|error| {
-        Failure::new(Kind::Store, error.to_string()).with_help("give another folder with --out")
+        Failure::new(Kind::Store, error.to_string()).with_help("give another place with --out")
     })?;
     match since_last_bake(&store, digest, &plan.config).await? {
         Before::Nothing => {}
         Before::Same => {
-            note(&format!("{} holds a bake of this input: going on with it", input.out))
+            note(&format!("{} holds a bake of this input: going on with it", store.location()))
         }
         Before::Other(changes) => {
-            note(&format!("{} holds a bake of other input:", input.out));
+            note(&format!("{} holds a bake of other input:", store.location()));
             for change in &changes {
                 note(&format!("  {change}"));
             }

@@ -4,8 +4,8 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared};
-use sightline_store::BakeStore;
+use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared, share_scene};
+use sightline_store::{BakeStore, redacted};
 use sightline_worker::{Worker, WorkerOptions};
 
 use super::bake::{open_store, prepare_on, read_config, stop_signal, watch};
@@ -21,6 +21,10 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
         let store = open_store(&command.input, &scene.digest, &plan).await?;
         // The scene is the workers' matter from here on.
         drop(scene);
+        let (scene, tables) = (&command.input.scene, &plan.config.scene.particles);
+        let found = super::scene::locate(scene, tables, &command.input.cache).await?;
+        let share = command.share_scene;
+        share_scene(&store, &plan.scene, &found.path, &plan.config, share).await?;
         let options = CoordinatorOptions::new(command.listen, store, plan, Arc::new(publisher));
         let mut coordinator = Coordinator::start(options).await?;
         note(&format!("waiting for workers: sightline worker --coordinator {}", coordinator.url()));
@@ -31,7 +35,10 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
     let changed = if ended.changed { "" } else { ", as it was" };
     let mut table = Table::default();
     table
-        .row("dataset", format!("{}, manifest {}{changed}", command.input.out, ended.manifest))
+        .row(
+            "dataset",
+            format!("{}, manifest {}{changed}", redacted(&command.input.out), ended.manifest),
+        )
         .row("cells", thousands(status.dataset_cells()))
         .row("segments", thousands(status.segments.total))
         .row("resumed", count(u64::from(status.tasks_resumed), "task"))
@@ -45,6 +52,7 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
 pub fn run_worker(command: &WorkerCommand) -> Result<()> {
     let mut options = WorkerOptions::new(&command.coordinator);
     options.scene_path.clone_from(&command.scene);
+    options.scene_access = command.cache.access(command.fetch_scene);
     options.store = command.out.as_deref().map(BakeStore::open).transpose()?;
     options.threads = command.threads.unwrap_or(0) as usize;
     options.name = format!("process {}", std::process::id());

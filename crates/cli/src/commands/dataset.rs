@@ -1,19 +1,20 @@
 //! Datasets and their scenes, as the commands open them.
 //!
 //! The scene of a dataset is, in this order: the one given by `--scene`; where a bake in the
-//! dataset's folder read it; a file of its name beside or in the dataset's folder. Whichever it
-//! is, its digest has to be the one in the manifest: primitive numbers mean nothing in another
+//! dataset's folder read it; a file of its name beside or in the dataset's folder; fetched from the URL
+//! that a bake read it from, or from the copies in the dataset's store. Whichever it is, its digest has to be the one in the manifest: primitive numbers mean nothing in another
 //! scene.
 
 use std::path::{Path, PathBuf};
 
 use futures::TryStreamExt;
 use serde_json::{Value, json};
-use sightline_jobs::Plan;
+use sightline_jobs::{Plan, SceneFile};
 use sightline_scene::{OpenOptions, Scene, SceneDigest};
-use sightline_store::{BakeStore, Dataset, Manifest, keys};
+use sightline_store::{BakeStore, Dataset, Manifest, keys, local_path};
+use sightline_worker::{SceneOnDisk, scene_files};
 
-use crate::arguments::DatasetInput;
+use crate::arguments::{CacheFlags, DatasetInput};
 use crate::failure::{Failure, Kind, Result};
 use crate::progress::note;
 
@@ -22,13 +23,14 @@ pub async fn open(location: &str) -> Result<Dataset> {
     Ok(Dataset::open(&BakeStore::open(location)?).await?)
 }
 
-/// Opens a dataset and the scene that it was baked from; the scene's path comes with it.
-pub async fn open_with_scene(input: &DatasetInput) -> Result<(Dataset, Scene, PathBuf)> {
+/// Opens a dataset and the scene that it was baked from; where the scene lies comes with it.
+pub async fn open_with_scene(input: &DatasetInput) -> Result<(Dataset, Scene, SceneOnDisk)> {
     let dataset = open(&input.dataset).await?;
-    let path = find_scene(&dataset, input).await?;
-    let scene = Scene::open(&path, &open_options(dataset.manifest(), &path))?;
-    expect_digest(dataset.manifest(), &scene.digest, &path)?;
-    Ok((dataset, scene, path))
+    let found = find_scene(&dataset, input).await?;
+    let options = found.with_tables(open_options(dataset.manifest(), &found.path));
+    let scene = Scene::open(&found.path, &options)?;
+    expect_digest(dataset.manifest(), &scene.digest, &found.path)?;
+    Ok((dataset, scene, found))
 }
 
 /// How the bake read the scene: see-through patterns decide what hides what, and particles are in tables
@@ -45,34 +47,53 @@ fn open_options(manifest: &Manifest, path: &Path) -> OpenOptions {
     OpenOptions::of_bake(
         path,
         &texts("see_through"),
-        &texts("particles"),
+        &tables(manifest),
         animation,
         motion_error.unwrap_or_else(|| OpenOptions::default().motion_error),
     )
 }
 
-async fn find_scene(dataset: &Dataset, input: &DatasetInput) -> Result<PathBuf> {
+/// The particle tables of the configuration.
+fn tables(manifest: &Manifest) -> Vec<String> {
+    let tables = manifest.config["scene"]["particles"].as_array();
+    tables.into_iter().flatten().filter_map(Value::as_str).map(str::to_owned).collect()
+}
+
+async fn find_scene(dataset: &Dataset, input: &DatasetInput) -> Result<SceneOnDisk> {
+    let manifest = dataset.manifest();
+    let tables = tables(manifest);
     if let Some(path) = &input.scene {
-        return Ok(path.clone());
+        return super::scene::locate(path, &tables, &input.cache).await;
     }
-    let source = &dataset.manifest().scene;
-    let folder = Path::new(input.dataset.strip_prefix("file://").unwrap_or(&input.dataset));
-    let mut candidates = Vec::new();
+    let source = &manifest.scene;
+    let mut uris = Vec::new();
     for plan in plans(dataset.store()).await? {
         if plan.scene.digest == source.hash {
-            candidates.push(scene_path(&plan.scene.uri));
+            uris.push(plan.scene.uri);
         }
     }
-    candidates.push(folder.join("..").join(&source.uri));
-    candidates.push(folder.join(&source.uri));
+    let mut candidates: Vec<PathBuf> = uris.iter().filter_map(|uri| local_path(uri)).collect();
+    if let Some(folder) = local_path(&input.dataset) {
+        candidates.push(folder.join("..").join(&source.uri));
+        candidates.push(folder.join(&source.uri));
+    }
     for path in &candidates {
-        let tables = open_options(dataset.manifest(), path).particles;
+        let tables = open_options(manifest, path).particles;
         let digest = || sightline_scene::digest_with(path, &tables);
         if path.is_file() && digest().is_ok_and(|d| d.combined == source.hash) {
-            return Ok(path.clone());
+            return Ok(SceneOnDisk::at(path.clone()));
         }
     }
-    let looked: Vec<String> = candidates.iter().map(|p| p.display().to_string()).collect();
+    let mut looked: Vec<String> = candidates.iter().map(|p| p.display().to_string()).collect();
+    uris.retain(|uri| local_path(uri).is_none());
+    // The store may hold copies, whether or not there is a URL.
+    uris.push(source.uri.clone());
+    for uri in uris {
+        match fetch(dataset, &uri, &tables, &input.cache).await {
+            Ok(found) => return Ok(found),
+            Err(error) => looked.push(error.to_string()),
+        }
+    }
     Err(Failure::new(
         Kind::Input,
         format!("the scene `{}` of this dataset was not found: {}", source.uri, looked.join(", ")),
@@ -80,9 +101,18 @@ async fn find_scene(dataset: &Dataset, input: &DatasetInput) -> Result<PathBuf> 
     .with_help("give the scene that was baked with --scene"))
 }
 
-/// The file that a scene's URI names.
-fn scene_path(uri: &str) -> PathBuf {
-    PathBuf::from(uri.strip_prefix("file://").unwrap_or(uri))
+/// The scene by the hashes of its files: from a URL, or from the copies in the dataset's store.
+async fn fetch(
+    dataset: &Dataset,
+    uri: &str,
+    tables: &[String],
+    cache: &CacheFlags,
+) -> Result<SceneOnDisk> {
+    let files = dataset.manifest().scene.files.iter();
+    let files: Vec<SceneFile> = files
+        .map(|f| SceneFile { path: f.name.clone(), bytes: f.bytes, digest: f.blake3.clone() })
+        .collect();
+    Ok(scene_files::fetch(uri, &files, tables, dataset.store(), &cache.open()?).await?)
 }
 
 fn expect_digest(manifest: &Manifest, found: &SceneDigest, path: &Path) -> Result<()> {

@@ -6,7 +6,7 @@ use serde_json::json;
 use sightline_geometry::Moment;
 use sightline_scene::Scene;
 use sightline_scene::export::{ExportOptions, ExportReport, export_visible_with};
-use sightline_store::{CellRow, Dataset};
+use sightline_store::{CellRow, Dataset, redacted};
 
 use super::dataset::open_with_scene;
 use crate::arguments::Export;
@@ -16,7 +16,7 @@ use crate::report::{Table, bytes, count, print, print_json, thousands};
 
 pub fn run(command: &Export) -> Result<()> {
     let runtime = super::runtime()?;
-    let (dataset, scene, path) = runtime.block_on(open_with_scene(&command.input))?;
+    let (dataset, scene, found) = runtime.block_on(open_with_scene(&command.input))?;
     super::expect_cell(&dataset, command.cell)?;
     let moment = moment(command, &dataset, &scene)?;
     let mut row = runtime.block_on(async {
@@ -28,10 +28,10 @@ pub fn run(command: &Export) -> Result<()> {
     if let Some(budget) = command.budget {
         row.set = row.most_important(usize::try_from(budget).unwrap_or(usize::MAX));
     }
-    let report = write(&path, &scene, &row, moment, &command.out)?;
+    let report = write(&found.path, &scene, &row, moment, &command.out)?;
     if command.json {
         print_json(&json!({
-            "dataset": command.input.dataset,
+            "dataset": redacted(&command.input.dataset),
             "cell": command.cell,
             "state": moment.map(|m| m.state),
             "out": command.out,

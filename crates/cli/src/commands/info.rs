@@ -5,7 +5,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 use sightline_geometry::{Bounds, CellId};
 use sightline_scene::{IngestReport, OpenOptions, Scene};
-use sightline_store::{CellRow, Dataset};
+use sightline_store::{CellRow, Dataset, is_url, redacted};
 
 use super::dataset::{self, Summary};
 use crate::arguments::Info;
@@ -14,9 +14,9 @@ use crate::memory::Phases;
 use crate::report::{Table, bytes, count, percent, print, print_json, thousands};
 
 pub fn run(command: &Info) -> Result<()> {
-    if command.path.is_dir() {
+    let location = command.path.display().to_string();
+    if is_dataset(&command.path) {
         let runtime = super::runtime()?;
-        let location = command.path.display().to_string();
         return runtime.block_on(async {
             let dataset = dataset::open(&location).await?;
             match command.cell {
@@ -29,7 +29,18 @@ pub fn run(command: &Info) -> Result<()> {
         return Err(Failure::new(Kind::Usage, "--cell asks for a cell, but PATH is no dataset")
             .with_help("give the folder of a dataset"));
     }
-    describe_scene(&command.path, command)
+    let found = super::scene::locate(&command.path, &[], &command.cache);
+    let found = super::runtime()?.block_on(found)?;
+    describe_scene(&found.path, command)
+}
+
+/// True for a folder, and for a URL that does not name a file of a scene.
+fn is_dataset(path: &Path) -> bool {
+    let names_a_scene = || {
+        let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+        ending.is_some_and(|e| ["gltf", "glb", "parquet", "csv"].contains(&e.as_str()))
+    };
+    path.is_dir() || (is_url(&path.to_string_lossy()) && !names_a_scene())
 }
 
 fn box_text(bounds: Bounds) -> String {
@@ -49,13 +60,13 @@ fn describe_scene(path: &Path, command: &Info) -> Result<()> {
     let scene = Scene::open(path, &OpenOptions::default())?;
     phases.finish();
     if command.json {
-        print_json(&scene_json(&scene, path, &phases));
+        print_json(&scene_json(&scene, &redacted(&command.path.display().to_string()), &phases));
         return Ok(());
     }
     let mut table = Table::default();
     let report = &scene.report;
     table
-        .row("scene", path.display().to_string())
+        .row("scene", redacted(&command.path.display().to_string()))
         .row("written by", report.generator.clone().unwrap_or_else(|| "unknown".into()))
         .row("digest", &scene.digest.combined[..16])
         .row("bounds", box_text(scene.geometry.bounds))
@@ -75,7 +86,7 @@ fn describe_scene(path: &Path, command: &Info) -> Result<()> {
     Ok(())
 }
 
-fn scene_json(scene: &Scene, path: &Path, phases: &Phases) -> Value {
+fn scene_json(scene: &Scene, path: &str, phases: &Phases) -> Value {
     let objects: Vec<Value> = scene
         .objects
         .iter()

@@ -9,6 +9,7 @@ mod demo;
 mod export;
 mod generate;
 mod info;
+mod scene;
 mod verify;
 
 use std::path::{Path, PathBuf};

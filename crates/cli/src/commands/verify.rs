@@ -207,9 +207,10 @@ fn exceeded(findings: &Findings, command: &Verify) -> Vec<String> {
 /// The command that measures the worst viewpoint again.
 fn reproduce(worst: &Worst, command: &Verify) -> String {
     let at = worst.error.viewpoint;
-    let mut text = format!("sightline verify {}", super::quoted(&command.input.dataset));
+    let shown = |location: &str| super::quoted(&sightline_store::redacted(location));
+    let mut text = format!("sightline verify {}", shown(&command.input.dataset));
     if let Some(scene) = &command.input.scene {
-        text.push_str(&format!(" --scene {}", super::quoted(&scene.display().to_string())));
+        text.push_str(&format!(" --scene {}", shown(&scene.display().to_string())));
     }
     // The shortest decimal form of an f64 reads back to the same bits.
     text.push_str(&format!(
@@ -242,7 +243,7 @@ fn to_json(findings: &Findings, command: &Verify, exceeded: &[String]) -> Value 
         })
     });
     json!({
-        "dataset": command.input.dataset,
+        "dataset": sightline_store::redacted(&command.input.dataset),
         "cells": findings.cells,
         "viewpoints": findings.viewpoints,
         "rays": findings.rays,

@@ -76,6 +76,23 @@ pub fn files(path: &Path) -> Result<Vec<(String, u64, blake3::Hash)>, SceneError
     Ok(buffers::Buffers::load(path, &main, parts.binary, &document)?.files().to_vec())
 }
 
+/// The files that the buffers of a glTF file name, relative to its folder, in their order, each once. Of
+/// buffers whose URIs are refused there is nothing here: opening the scene says why.
+pub fn external_buffers(path: &Path) -> Result<Vec<String>, SceneError> {
+    let main = read_main_file(path)?;
+    let parts = container::split(&main)?;
+    let document = document::Document::parse(parts.json)?;
+    let mut names = Vec::new();
+    for uri in document.buffers.iter().filter_map(|buffer| buffer.uri.as_deref()) {
+        if let Ok(uri::Target::File(name)) = uri::resolve(uri)
+            && !names.contains(&name)
+        {
+            names.push(name);
+        }
+    }
+    Ok(names)
+}
+
 fn read_main_file(path: &Path) -> Result<Vec<u8>, SceneError> {
     let read = |source| SceneError::from(Cause::Read { source });
     // Opening a named pipe would wait for a writer.

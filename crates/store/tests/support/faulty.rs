@@ -24,6 +24,10 @@ pub enum Fault {
     AnswersLost,
     /// Puts do not happen, and no answer comes.
     RequestsLost,
+    /// The client tries a put again that has succeeded, and is told that the object exists.
+    TriedAgain,
+    /// The first so many puts meet another that is under way, which comes to nothing.
+    Conflicts(u64),
     /// Creating if absent overwrites and always succeeds.
     EveryoneWins,
     /// After so many puts, the process is gone.
@@ -60,6 +64,10 @@ impl Faulty {
     }
 }
 
+fn exists(path: &Path) -> Error {
+    Error::AlreadyExists { path: path.to_string(), source: "it is there".into() }
+}
+
 fn lost() -> Error {
     Error::Generic { store: "faulty", source: "the answer did not come".into() }
 }
@@ -75,12 +83,17 @@ impl ObjectStore for Faulty {
         let before = self.puts.fetch_add(1, Ordering::Relaxed);
         match self.fault {
             Fault::RequestsLost => return Err(lost()),
+            Fault::Conflicts(puts) if before < puts => return Err(exists(location)),
             Fault::CrashAfter(puts) if before >= puts => return Err(lost()),
             Fault::EveryoneWins => opts.mode = PutMode::Overwrite,
             _ => {}
         }
         let result = self.inner.put_opts(location, payload, opts).await?;
-        if self.fault == Fault::AnswersLost { Err(lost()) } else { Ok(result) }
+        match self.fault {
+            Fault::AnswersLost => Err(lost()),
+            Fault::TriedAgain => Err(exists(location)),
+            _ => Ok(result),
+        }
     }
 
     async fn put_multipart_opts(

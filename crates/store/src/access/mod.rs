@@ -7,27 +7,41 @@
 //! - [`BakeStore::create`] makes an object appear at once with all of its bytes, or not at all,
 //!   and at most one of several callers is told [`Created::ByUs`] as long as their bytes differ.
 //!   (A file appears by a hard link to a synced temporary file; other stores by a conditional put.)
+//!   A put whose answer was lost, or that the client below tried again after it had succeeded, is
+//!   settled by reading the object back.
 //! - [`BakeStore::put_pointer`] replaces an object at once; a reader gets the old or the new bytes.
 //! - When either returns, the bytes survive a power cut (files and their folders are synced).
 //!
 //! Stores that cannot keep the first promise exist; [`BakeStore::probe`] finds them.
+//!
+//! Nothing secret leaves this module: locations are shown without passwords and signatures, and what a
+//! backend reports is cleaned of both (`failure`).
 
-use std::hash::{BuildHasher, RandomState};
+mod failure;
+mod large;
+mod location;
+mod open;
+mod probe;
+
 use std::ops::Range;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures::TryStreamExt;
-use object_store::local::LocalFileSystem;
 use object_store::memory::InMemory;
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt, ObjectStoreScheme, PutMode, PutOptions};
-use url::Url;
+use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions};
 
-use crate::{Result, StoreError, keys};
+use crate::{Result, StoreError};
+pub use large::ObjectVersion;
+pub use location::{is_url, key_beside, local_path, redacted};
 
-/// Tasks that race in [`BakeStore::probe`].
-const PROBE_RACERS: usize = 8;
+/// How often a put is made whose refusal names an object that is not there: S3 answers so while
+/// another conditional put of the key is under way.
+const CONFLICT_TRIES: u32 = 8;
+/// The first pause between those; each is twice as long as the one before, 6 s together.
+const CONFLICT_PAUSE: Duration = Duration::from_millis(50);
 
 /// Who made an object exist.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,28 +53,61 @@ pub enum Created {
 }
 
 /// An object store and the folder in it that holds a bake or a dataset. Cheap to clone.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct BakeStore {
     objects: Arc<dyn ObjectStore>,
     prefix: Path,
+    /// Without secrets.
     location: String,
+    /// Texts that must not appear in any message.
+    secrets: Arc<[String]>,
+    /// What to do when the store does not let us in; empty where there is nothing to say.
+    access_help: &'static str,
+    is_remote: bool,
+}
+
+impl std::fmt::Debug for BakeStore {
+    /// The backends' own form may show credentials.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "BakeStore({})", self.location)
+    }
 }
 
 impl BakeStore {
-    /// Opens an existing folder by its path or `file://` URL.
+    /// Opens an existing folder by its path or `file://` URL, or a prefix of a bucket by its URL:
+    /// `s3://bucket/prefix`, `gs://bucket/prefix`, `az://container/prefix`,
+    /// `abfss://container@account.dfs.core.windows.net/prefix`, or the `https` form of these.
+    /// Credentials and the server's address come from the environment.
     ///
     /// # Errors
-    /// [`StoreError::BadLocation`] when there is no such folder, or the URL's scheme is unknown.
+    /// [`StoreError::BadLocation`] when there is no such folder, the URL's scheme is unknown, or
+    /// credentials are missing. Whether a bucket exists shows at the first request.
     pub fn open(location: &str) -> Result<Self> {
-        Self::open_location(location, false)
+        open::open(location, false)
     }
 
-    /// Opens a folder by its path or `file://` URL, making it when it does not exist.
+    /// As [`BakeStore::open`]; makes a folder that does not exist. Buckets are not made.
     ///
     /// # Errors
-    /// [`StoreError::BadLocation`] when it cannot be made, or the URL's scheme is unknown.
+    /// As [`BakeStore::open`]; when the folder cannot be made.
     pub fn open_or_create(location: &str) -> Result<Self> {
-        Self::open_location(location, true)
+        open::open(location, true)
+    }
+
+    /// Opens the store that holds the object a URL names. The key comes with it, relative to the whole
+    /// bucket.
+    ///
+    /// # Errors
+    /// As [`BakeStore::open`]; [`StoreError::BadLocation`] when the URL names no object.
+    pub fn open_object(url: &str) -> Result<(Self, String)> {
+        let mut store = open::open(url, false)?;
+        let key = std::mem::take(&mut store.prefix).to_string();
+        if key.is_empty() {
+            let problem = "it names a bucket, not an object in it".into();
+            return Err(StoreError::BadLocation { location: store.location, problem });
+        }
+        store.location = location::root_of(&store.location, &key);
+        Ok((store, key))
     }
 
     /// An empty store in memory, for tests.
@@ -72,42 +119,21 @@ impl BakeStore {
     /// Wraps an object store that was opened elsewhere. `location` is for messages only.
     #[must_use]
     pub fn new(objects: Arc<dyn ObjectStore>, prefix: Path, location: &str) -> Self {
-        Self { objects, prefix, location: location.to_owned() }
+        let location = redacted(location);
+        let secrets = Arc::default();
+        Self { objects, prefix, location, secrets, access_help: "", is_remote: false }
     }
 
-    fn open_location(location: &str, make: bool) -> Result<Self> {
-        let bad = |problem: String| StoreError::BadLocation { location: location.into(), problem };
-        if !location.contains("://") {
-            return Self::open_folder(location, std::path::Path::new(location), make);
-        }
-        let url = Url::parse(location).map_err(|e| bad(e.to_string()))?;
-        let (scheme, _) = ObjectStoreScheme::parse(&url).map_err(|e| bad(e.to_string()))?;
-        match scheme {
-            ObjectStoreScheme::Local => {
-                let folder = url.to_file_path().map_err(|()| bad("it names no file".into()))?;
-                Self::open_folder(location, &folder, make)
-            }
-            // Network stores arrive behind cargo features, through `object_store::parse_url_opts`.
-            _ => Err(bad(format!("this build has no support for `{}` URLs", url.scheme()))),
-        }
-    }
-
-    fn open_folder(location: &str, folder: &std::path::Path, make: bool) -> Result<Self> {
-        let bad = |problem: String| StoreError::BadLocation { location: location.into(), problem };
-        if make {
-            std::fs::create_dir_all(folder).map_err(|e| bad(e.to_string()))?;
-        }
-        if !folder.is_dir() {
-            return Err(bad("there is no such folder".into()));
-        }
-        let files = LocalFileSystem::new_with_prefix(folder).map_err(|e| bad(e.to_string()))?;
-        Ok(Self::new(Arc::new(files.with_fsync(true)), Path::default(), location))
-    }
-
-    /// The location as it was given, for messages.
+    /// The location as it was given, without what is secret in it.
     #[must_use]
     pub fn location(&self) -> &str {
         &self.location
+    }
+
+    /// True for a store that is reached over a network.
+    #[must_use]
+    pub const fn is_remote(&self) -> bool {
+        self.is_remote
     }
 
     /// All bytes of an object.
@@ -179,24 +205,53 @@ impl BakeStore {
 
     /// Creates an object unless it exists.
     ///
-    /// When the store's answer is lost (a timeout, say), the object is read back: our bytes there
-    /// count as created by us. So where two callers must not both win, their bytes must differ,
-    /// by an attempt's or a process's id, for example.
+    /// Where the store's answer is lost (a timeout, say), and where it says that the object exists, the
+    /// object is read back: our bytes there count as created by us, since a request that is tried again
+    /// meets what its first try created. So where two callers must not both win, their bytes must
+    /// differ, by an attempt's or a process's id, for example.
     ///
     /// # Errors
     /// What the store reports. After an error the object may exist; calling again settles it.
     pub async fn create(&self, key: &str, bytes: impl Into<Bytes>) -> Result<Created> {
         let bytes: Bytes = bytes.into();
         let path = self.path(key)?;
+        let mut pause = CONFLICT_PAUSE;
+        for _ in 1..CONFLICT_TRIES {
+            match self.put_if_absent(&path, key, &bytes).await? {
+                Some(created) => return Ok(created),
+                None => tokio::time::sleep(pause).await,
+            }
+            pause *= 2;
+        }
+        match self.put_if_absent(&path, key, &bytes).await? {
+            Some(created) => Ok(created),
+            None => Err(StoreError::Unavailable {
+                key: key.to_owned(),
+                source: "it answers that the object is being written by another".into(),
+            }),
+        }
+    }
+
+    /// One try of [`BakeStore::create`]; `None` when the store refused for an object that is not there.
+    async fn put_if_absent(
+        &self,
+        path: &Path,
+        key: &str,
+        bytes: &Bytes,
+    ) -> Result<Option<Created>> {
         let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
-        match self.objects.put_opts(&path, bytes.clone().into(), options).await {
-            Ok(_) => Ok(Created::ByUs),
-            Err(object_store::Error::AlreadyExists { .. }) => Ok(Created::AlreadyThere),
-            Err(error) => match self.get_if_exists(key).await {
-                Ok(Some(found)) if found == bytes => Ok(Created::ByUs),
-                Ok(Some(_)) => Ok(Created::AlreadyThere),
-                Ok(None) | Err(_) => Err(self.error(key, error)),
-            },
+        let put = self.objects.put_opts(path, bytes.clone().into(), options).await;
+        let Err(error) = put else { return Ok(Some(Created::ByUs)) };
+        let exists = matches!(
+            error,
+            object_store::Error::AlreadyExists { .. } | object_store::Error::Precondition { .. }
+        );
+        match self.get_if_exists(key).await {
+            Ok(Some(found)) if found == *bytes => Ok(Some(Created::ByUs)),
+            Ok(Some(_)) => Ok(Some(Created::AlreadyThere)),
+            Ok(None) if exists => Ok(None),
+            Err(unread) if exists => Err(unread),
+            Ok(None) | Err(_) => Err(self.error(key, error)),
         }
     }
 
@@ -242,53 +297,6 @@ impl BakeStore {
         Ok(found)
     }
 
-    /// Verifies that creating if absent has exactly one winner, and that the winner's bytes can be
-    /// read and listed. Leaves nothing behind.
-    ///
-    /// # Errors
-    /// [`StoreError::UnsafeStore`] when the store breaks a promise, or what the store reports.
-    pub async fn probe(&self) -> Result<()> {
-        // Ids come through seams; this one names scratch that is deleted below and decides nothing.
-        let scratch = RandomState::new().hash_one(std::process::id());
-        let key = format!("{}/{scratch:016x}", keys::PROBE_FOLDER);
-        let outcome = self.race(&key).await;
-        let cleaned = self.delete(&key).await;
-        outcome.and(cleaned)
-    }
-
-    async fn race(&self, key: &str) -> Result<()> {
-        let broken =
-            |problem: String| StoreError::UnsafeStore { location: self.location.clone(), problem };
-        let racers = (0..PROBE_RACERS).map(|racer| {
-            let (store, key) = (self.clone(), key.to_owned());
-            tokio::spawn(async move { store.create(&key, format!("racer {racer}")).await })
-        });
-        let mut winners = Vec::new();
-        for (racer, result) in futures::future::join_all(racers).await.into_iter().enumerate() {
-            let created = result.map_err(|source| StoreError::Unavailable {
-                key: key.to_owned(),
-                source: Box::new(source),
-            })??;
-            if created == Created::ByUs {
-                winners.push(racer);
-            }
-        }
-        let [winner] = winners[..] else {
-            let count = winners.len();
-            return Err(broken(format!(
-                "{PROBE_RACERS} writers created one object at the same time, and {count} were \
-                 told that they were first; exactly one must be"
-            )));
-        };
-        if self.get(key).await? != format!("racer {winner}").as_bytes() {
-            return Err(broken("an object does not hold the bytes of the writer that won".into()));
-        }
-        if !self.list(keys::PROBE_FOLDER).await?.iter().any(|k| k == key) {
-            return Err(broken("an object that was created is not listed".into()));
-        }
-        Ok(())
-    }
-
     async fn delete(&self, key: &str) -> Result<()> {
         match self.objects.delete(&self.path(key)?).await {
             Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
@@ -307,34 +315,6 @@ impl BakeStore {
     }
 
     fn error(&self, key: &str, error: object_store::Error) -> StoreError {
-        use object_store::Error as E;
-        let key = key.to_owned();
-        match error {
-            E::NotFound { .. } => StoreError::NotFound { key, location: self.location.clone() },
-            E::InvalidPath { .. }
-            | E::NotSupported { .. }
-            | E::NotImplemented { .. }
-            | E::PermissionDenied { .. }
-            | E::Unauthenticated { .. }
-            | E::UnknownConfigurationKey { .. } => {
-                StoreError::Refused { key, source: Box::new(error) }
-            }
-            _ if refused_by_the_system(&error) => {
-                StoreError::Refused { key, source: Box::new(error) }
-            }
-            _ => StoreError::Unavailable { key, source: Box::new(error) },
-        }
+        failure::explain(self, key, error)
     }
-}
-
-/// True when an I/O error below `error` will not pass by itself.
-fn refused_by_the_system(error: &(dyn std::error::Error + 'static)) -> bool {
-    use std::io::ErrorKind as K;
-    let chain = std::iter::successors(Some(error), |e| e.source());
-    chain.filter_map(|e| e.downcast_ref::<std::io::Error>()).any(|e| {
-        matches!(
-            e.kind(),
-            K::PermissionDenied | K::ReadOnlyFilesystem | K::NotADirectory | K::IsADirectory
-        )
-    })
 }
