@@ -11,16 +11,18 @@ use std::time::Duration;
 use sightline_jobs::{BakeStatus, Outcome, Phase, Plan, SchedulePolicy};
 use sightline_proto::v1::coordinator_server::CoordinatorServer;
 use sightline_proto::{MESSAGE_BYTES_MAX, v1};
-use sightline_store::BakeStore;
-use tokio::net::TcpListener;
+use sightline_store::{BakeStore, Operation};
+use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
-use tokio_stream::wrappers::TcpListenerStream;
 
 use crate::CoordinatorError;
+use crate::accept::connections;
 use crate::clock::{Clock, MonotonicClock};
 use crate::dataset::Publish;
 use crate::journal::Journal;
+use crate::metrics::{CountLayer, Metrics};
+use crate::security::{Gate, GateLayer, SecurityOptions};
 use crate::service::{Service, Shared};
 use crate::state::State;
 
@@ -30,6 +32,18 @@ const TICK_MS: u64 = 100;
 const DRAIN_TIME: Duration = Duration::from_secs(2);
 /// Time between two looks for a newer epoch in the store, ms.
 const EPOCH_CHECK_MS: u64 = 5_000;
+/// The same when somebody spoke of a newer epoch: who says so again and again costs little.
+const EPOCH_DOUBT_MS: u64 = 500;
+/// Calls that a connection may have in flight.
+const STREAMS_MAX: u32 = 256;
+/// Longest time until a call is answered, or its answer begins.
+const REQUEST_TIME: Duration = Duration::from_secs(30);
+/// Largest headers of a call, bytes.
+const HEADER_BYTES_MAX: u32 = 16 << 10;
+/// A connection on which nothing is heard for as long is asked whether it is alive, and has so long
+/// to answer.
+const KEEPALIVE_EVERY: Duration = Duration::from_secs(20);
+const KEEPALIVE_TIME: Duration = Duration::from_secs(20);
 
 /// How to run a bake.
 pub struct CoordinatorOptions {
@@ -49,6 +63,13 @@ pub struct CoordinatorOptions {
     pub linger: Duration,
     /// The clock that leases are measured with.
     pub clock: Arc<dyn Clock>,
+    /// Who may talk to the coordinator.
+    pub security: SecurityOptions,
+    /// Where to answer health checks without encryption, beside the service itself: probes have no
+    /// certificates.
+    pub health: Option<SocketAddr>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
 }
 
 impl CoordinatorOptions {
@@ -69,6 +90,9 @@ impl CoordinatorOptions {
             worker_wait: None,
             linger: Duration::from_secs(5),
             clock: Arc::new(MonotonicClock::default()),
+            security: SecurityOptions::default(),
+            health: None,
+            metrics: Arc::default(),
         }
     }
 }
@@ -91,6 +115,7 @@ pub struct Coordinator;
 pub struct CoordinatorHandle {
     /// Where it listens.
     pub addr: SocketAddr,
+    is_encrypted: bool,
     status: watch::Receiver<BakeStatus>,
     stop: Option<oneshot::Sender<()>>,
     end: JoinHandle<Result<Summary, CoordinatorError>>,
@@ -100,7 +125,8 @@ impl CoordinatorHandle {
     /// The address for workers on this machine, as a URL.
     #[must_use]
     pub fn url(&self) -> String {
-        format!("http://{}", self.addr)
+        let scheme = if self.is_encrypted { "https" } else { "http" };
+        format!("{scheme}://{}", self.addr)
     }
 
     /// The status, now and at every change.
@@ -136,19 +162,28 @@ impl Coordinator {
     ///
     /// # Errors
     /// When the store breaks its promises, holds another plan, or cannot be listened for.
-    pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, CoordinatorError> {
-        let listener = TcpListener::bind(options.listen)
-            .await
-            .map_err(|source| CoordinatorError::Listen { address: options.listen, source })?;
-        let addr = listener
-            .local_addr()
-            .map_err(|source| CoordinatorError::Listen { address: options.listen, source })?;
+    pub async fn start(
+        mut options: CoordinatorOptions,
+    ) -> Result<CoordinatorHandle, CoordinatorError> {
+        let counted = options.metrics.store.clone();
+        let observer = Arc::new(move |o: Operation| counted.operation(o.kind, o.result, o.time));
+        options.store = options.store.observed(observer);
+        let gate = Gate::new(&options.security, options.listen, Arc::clone(&options.metrics))?;
+        let gate = Arc::new(gate);
+        let (listener, addr) = listen(options.listen).await?;
+        let probes = match options.health {
+            Some(address) => Some(listen(address).await?),
+            None => None,
+        };
         let (shared, status) = open_bake(&options, addr).await?;
         let (stop, stopped) = oneshot::channel();
         let (stop_server, server_stopped) = oneshot::channel();
-        let server = tokio::spawn(serve(listener, Arc::clone(&shared), server_stopped));
+        let is_encrypted = gate.tls().is_some();
+        let probes = probes.map(|(listener, _)| HealthListener::start(listener, &gate));
+        let server = tokio::spawn(serve(listener, Arc::clone(&shared), gate, server_stopped));
         let run = Run { shared, options, addr, epoch_checked_ms: 0 };
         let end = tokio::spawn(async move {
+            let _probes = probes;
             let end = run.drive(stopped).await;
             let _ = stop_server.send(());
             match server.await {
@@ -157,8 +192,15 @@ impl Coordinator {
                 Err(error) => end.and(Err(CoordinatorError::Defect(error.to_string()))),
             }
         });
-        Ok(CoordinatorHandle { addr, status, stop: Some(stop), end })
+        Ok(CoordinatorHandle { addr, is_encrypted, status, stop: Some(stop), end })
     }
+}
+
+async fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {
+    let failed = |source| CoordinatorError::Listen { address, source };
+    let listener = TcpListener::bind(address).await.map_err(failed)?;
+    let bound = listener.local_addr().map_err(failed)?;
+    Ok((listener, bound))
 }
 
 /// The steps of [`crate::journal`].
@@ -195,6 +237,7 @@ async fn open_bake(
         store_location: absolute(store.location()),
         scene_uri: absolute(&plan.scene.uri),
         lease_ms: policy.lease_ms,
+        metrics: Arc::clone(&options.metrics),
     };
     Ok((Arc::new(shared), watched))
 }
@@ -220,6 +263,7 @@ fn absolute(location: &str) -> String {
 async fn serve(
     listener: TcpListener,
     shared: Arc<Shared>,
+    gate: Arc<Gate>,
     stopped: oneshot::Receiver<()>,
 ) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let (health, health_service) = tonic_health::server::health_reporter();
@@ -227,15 +271,19 @@ async fn serve(
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
         .build_v1()?;
+    let counts = CountLayer(shared.metrics.as_ref().clone());
     let service = CoordinatorServer::new(Service(shared))
         .max_decoding_message_size(MESSAGE_BYTES_MAX)
         .max_encoding_message_size(MESSAGE_BYTES_MAX);
     let (draining, drain) = oneshot::channel();
-    let server = tonic::transport::Server::builder()
+    let incoming = connections(stream_of(listener), Arc::clone(&gate));
+    let server = limited()
+        .layer(counts)
+        .layer(GateLayer(gate))
         .add_service(health_service)
         .add_service(reflection)
         .add_service(service)
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async {
+        .serve_with_incoming_shutdown(incoming, async {
             // A dropped sender asks for the end too.
             let _ = stopped.await;
             let _ = draining.send(());
@@ -251,6 +299,54 @@ async fn serve(
     tokio::select! {
         served = server => Ok(served?),
         () = drained => Ok(()),
+    }
+}
+
+/// A server that nobody can make hold more than a bounded amount, and that notices who is gone.
+fn limited() -> tonic::transport::Server {
+    tonic::transport::Server::builder()
+        .max_concurrent_streams(STREAMS_MAX)
+        .concurrency_limit_per_connection(STREAMS_MAX as usize)
+        .timeout(REQUEST_TIME)
+        .http2_max_header_list_size(HEADER_BYTES_MAX)
+        .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
+        .http2_keepalive_timeout(Some(KEEPALIVE_TIME))
+        .tcp_keepalive(Some(KEEPALIVE_EVERY))
+}
+
+/// Accepted connections with their addresses.
+fn stream_of(
+    listener: TcpListener,
+) -> impl futures::Stream<Item = std::io::Result<(TcpStream, SocketAddr)>> + Send {
+    futures::stream::unfold(listener, |listener| async move {
+        let accepted = listener.accept().await.and_then(|(stream, address)| {
+            stream.set_nodelay(true)?;
+            Ok((stream, address))
+        });
+        Some((accepted, listener))
+    })
+}
+
+/// Answers health checks and nothing else, in plain text; stops when it is dropped.
+struct HealthListener(JoinHandle<()>);
+
+impl HealthListener {
+    fn start(listener: TcpListener, gate: &Gate) -> Self {
+        let open = Arc::new(gate.without_credentials());
+        Self(tokio::spawn(async move {
+            let (health, service) = tonic_health::server::health_reporter();
+            health.set_serving::<CoordinatorServer<Service>>().await;
+            let incoming = connections(stream_of(listener), open);
+            if let Err(error) = limited().add_service(service).serve_with_incoming(incoming).await {
+                tracing::warn!(%error, "health is not answered any more");
+            }
+        }))
+    }
+}
+
+impl Drop for HealthListener {
+    fn drop(&mut self) {
+        self.0.abort();
     }
 }
 
@@ -335,7 +431,13 @@ impl Run {
         let now_ms = self.shared.clock.now_ms();
         let lost = self.shared.state().tick(now_ms);
         for lease in &lost {
-            tracing::warn!(task = lease.task.0, worker = %lease.worker, "a lease ran out");
+            self.shared.metrics.lease_lost();
+            tracing::warn!(
+                task = lease.task.0,
+                lease = lease.id.0,
+                worker = %lease.worker,
+                "a lease ran out"
+            );
             if self.shared.journal.commit(lease.task).await?.is_some() {
                 self.shared.change(|state, _| state.committed(lease.task, None));
             }
@@ -348,7 +450,9 @@ impl Run {
 
     async fn check_epoch(&mut self) -> Result<(), CoordinatorError> {
         let now_ms = self.shared.clock.now_ms();
-        if now_ms.saturating_sub(self.epoch_checked_ms) >= EPOCH_CHECK_MS {
+        let since_ms = now_ms.saturating_sub(self.epoch_checked_ms);
+        let is_in_doubt = since_ms >= EPOCH_DOUBT_MS && self.shared.state().take_doubt();
+        if is_in_doubt || since_ms >= EPOCH_CHECK_MS {
             self.epoch_checked_ms = now_ms;
             let newest = self.shared.journal.newest_epoch().await?;
             self.shared.state().see_epoch(newest);

@@ -7,9 +7,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Parser;
-use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared, Summary, prepare};
+use sightline_coordinator::{
+    Coordinator, CoordinatorOptions, Prepared, SecurityFlags, Summary, prepare,
+};
 use sightline_jobs::BakeConfig;
 use sightline_store::BakeStore;
+use sightline_telemetry::metrics::{Listener, Registry};
+use sightline_telemetry::stop::signalled;
+use sightline_telemetry::{LogOptions, Telemetry, WatchFlags};
 
 /// Plans a bake, leases its tasks to workers, publishes the dataset.
 #[derive(Debug, Parser)]
@@ -35,16 +40,30 @@ struct Arguments {
     /// Give up after this time without any worker, s. Without it, wait for ever.
     #[arg(long, value_name = "SECONDS")]
     worker_wait: Option<u64>,
+    #[command(flatten)]
+    security: SecurityFlags,
+    /// Answer health checks there in plain text, and nothing else: for probes, which have no
+    /// certificates.
+    #[arg(long, value_name = "HOST:PORT", env = "SIGHTLINE_HEALTH")]
+    health: Option<SocketAddr>,
+    #[command(flatten)]
+    watch: WatchFlags,
 }
 
 type Error = Box<dyn std::error::Error + Send + Sync>;
 
-#[tokio::main]
-async fn main() -> ExitCode {
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
-    match run(Arguments::parse()).await {
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let format = arguments.watch.log_format;
+    let logs = LogOptions { format, filter: "info", service: "sightline-coordinator" };
+    let telemetry = Telemetry::to_stderr(logs);
+    let runtime = tokio::runtime::Runtime::new().map_err(Error::from);
+    let ended = match (&telemetry, runtime) {
+        (Err(error), _) => Err(error.to_string().into()),
+        (_, Err(error)) => Err(error),
+        (Ok(_), Ok(runtime)) => runtime.block_on(run(arguments)),
+    };
+    match ended {
         Ok(summary) => {
             tracing::info!(
                 manifest = summary.manifest,
@@ -79,6 +98,14 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
 
     let mut options = CoordinatorOptions::new(arguments.listen, store, plan, Arc::new(publisher));
     options.policy.lease_ms = arguments.lease_ms;
+    options.security = arguments.security.into();
+    options.health = arguments.health;
+    let mut registry = Registry::default();
+    options.metrics.register(&mut registry);
+    let _listener = match arguments.watch.metrics {
+        Some(address) => Some(Listener::start(address, registry).await?),
+        None => None,
+    };
     options.worker_wait = arguments.worker_wait.map(Duration::from_secs);
     let mut coordinator = Coordinator::start(options).await?;
     let mut status = coordinator.status();
@@ -88,23 +115,4 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
         () = signalled() => coordinator.shutdown(),
     }
     Ok(coordinator.join().await?)
-}
-
-/// Until someone asks the process to stop.
-async fn signalled() {
-    #[cfg(unix)]
-    {
-        use tokio::signal::unix::{SignalKind, signal};
-        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
-            tokio::select! {
-                _ = terminate.recv() => {}
-                _ = tokio::signal::ctrl_c() => {}
-            }
-            return;
-        }
-    }
-    // Without a handler the default action applies: the process ends.
-    if tokio::signal::ctrl_c().await.is_err() {
-        std::future::pending::<()>().await;
-    }
 }

@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 
 use sightline_jobs::{
-    BakeStatus, Done, FailureClass, Lease, LeaseId, Outcome, Phase, Plan, QuarantinedTask,
-    SchedulePolicy, Scheduler, TaskId, TaskKind, WorkerId, WorkerStatus,
+    BakeStatus, Done, FailureClass, Lease, LeaseId, LeaseStatus, Outcome, Phase, Plan,
+    QuarantinedTask, SchedulePolicy, Scheduler, TaskAttempts, TaskId, TaskKind, WorkerId,
+    WorkerStatus,
 };
 
 /// A registered worker.
@@ -13,6 +14,26 @@ struct Registered {
     name: String,
     threads: u32,
     tasks_committed: u32,
+}
+
+/// A lease that was given out.
+#[derive(Clone, Copy, Debug)]
+struct GivenOut {
+    since_ms: u64,
+    attempt: u32,
+}
+
+/// What is known of the tasks of one kind that were committed.
+#[derive(Clone, Copy, Debug, Default)]
+struct Usual {
+    tasks: u64,
+    solve_ms: u64,
+}
+
+impl Usual {
+    const fn mean_ms(self) -> u64 {
+        if self.tasks == 0 { 0 } else { self.solve_ms / self.tasks }
+    }
 }
 
 /// Why a bake ends.
@@ -43,8 +64,15 @@ pub(crate) struct State {
     ending: Option<Ending>,
     /// The coordinator ends and the bake does not: workers are to look for the next one.
     is_closed: bool,
-    /// The newest epoch that anybody showed us, when it is newer than ours.
+    /// The newest epoch in the store, when it is newer than ours.
     newer_epoch: Option<u64>,
+    /// Somebody showed us a newer epoch; only the store is believed.
+    is_epoch_in_doubt: bool,
+    /// Certificates of those who registered with one.
+    owners: BTreeMap<WorkerId, blake3::Hash>,
+    given_out: BTreeMap<LeaseId, GivenOut>,
+    attempted_again: BTreeMap<TaskId, u32>,
+    usual: BTreeMap<&'static str, Usual>,
 }
 
 impl State {
@@ -68,6 +96,11 @@ impl State {
             ending: None,
             is_closed: false,
             newer_epoch: None,
+            is_epoch_in_doubt: false,
+            owners: BTreeMap::new(),
+            given_out: BTreeMap::new(),
+            attempted_again: BTreeMap::new(),
+            usual: BTreeMap::new(),
         }
     }
 
@@ -119,7 +152,17 @@ impl State {
         self.ending.clone()
     }
 
-    /// Notes an epoch that somebody showed us.
+    /// Somebody says that there is this epoch. Anybody can say so: the coordinator looks.
+    pub const fn hear_of_epoch(&mut self, epoch: u64) {
+        self.is_epoch_in_doubt |= epoch > self.epoch;
+    }
+
+    /// Whether somebody spoke of a newer epoch since the last time.
+    pub const fn take_doubt(&mut self) -> bool {
+        std::mem::replace(&mut self.is_epoch_in_doubt, false)
+    }
+
+    /// Notes an epoch that is in the store.
     pub fn see_epoch(&mut self, epoch: u64) {
         if epoch > self.epoch {
             self.newer_epoch = self.newer_epoch.max(Some(epoch));
@@ -140,6 +183,21 @@ impl State {
         self.scheduler.knows(worker)
     }
 
+    /// Binds a worker to the certificate it registered with.
+    pub fn own(&mut self, worker: WorkerId, owner: Option<blake3::Hash>) {
+        self.owners.extend(owner.map(|owner| (worker, owner)));
+    }
+
+    /// True when a caller with this certificate may speak for the worker.
+    pub fn is_owned_by(&self, worker: WorkerId, caller: Option<blake3::Hash>) -> bool {
+        self.owners.get(&worker).is_none_or(|owner| caller == Some(*owner))
+    }
+
+    /// True when the worker holds the lease.
+    pub fn holds(&self, worker: WorkerId, lease: LeaseId) -> bool {
+        self.scheduler.lease_in_force(lease).is_some_and(|lease| lease.worker == worker)
+    }
+
     pub fn name_of(&self, worker: WorkerId) -> &str {
         self.registered.get(&worker).map_or("?", |w| w.name.as_str())
     }
@@ -147,6 +205,7 @@ impl State {
     pub fn leave(&mut self, worker: WorkerId) {
         self.scheduler.leave(worker);
         self.registered.remove(&worker);
+        self.owners.remove(&worker);
     }
 
     pub fn worker_count(&self) -> usize {
@@ -155,7 +214,13 @@ impl State {
 
     pub fn lease(&mut self, worker: WorkerId, now_ms: u64) -> Option<Lease> {
         self.scheduler.heartbeat(worker, &[], now_ms);
-        (self.phase == Phase::Solving).then(|| self.scheduler.lease(worker, now_ms)).flatten()
+        let solves = self.phase == Phase::Solving;
+        let lease = solves.then(|| self.scheduler.lease(worker, now_ms)).flatten()?;
+        self.given_out.insert(lease.id, GivenOut { since_ms: now_ms, attempt: lease.attempt });
+        if lease.attempt > 1 {
+            self.attempted_again.insert(lease.task, lease.attempt);
+        }
+        Some(lease)
     }
 
     pub fn heartbeat(&mut self, worker: WorkerId, held: &[LeaseId], now_ms: u64) -> Vec<LeaseId> {
@@ -166,6 +231,11 @@ impl State {
         let is_news = self.scheduler.committed(task);
         if let Some((worker, solve_ms)) = by {
             self.worker_solve_ms += solve_ms;
+            if is_news {
+                let usual = self.usual.entry(self.plan.task(task).kind.name()).or_default();
+                usual.tasks += 1;
+                usual.solve_ms = usual.solve_ms.saturating_add(solve_ms);
+            }
             if let Some(worker) = self.registered.get_mut(&worker).filter(|_| is_news) {
                 worker.tasks_committed += 1;
             }
@@ -191,6 +261,8 @@ impl State {
         let lost = self.scheduler.expire(now_ms);
         let scheduler = &self.scheduler;
         self.registered.retain(|worker, _| scheduler.knows(*worker));
+        self.owners.retain(|worker, _| scheduler.knows(*worker));
+        self.given_out.retain(|lease, _| scheduler.lease_in_force(*lease).is_some());
         if self.worker_count() > 0 {
             self.workers_seen_ms = now_ms;
         }
@@ -226,9 +298,15 @@ impl State {
             joins,
             tasks_resumed: self.tasks_resumed,
             workers: self.worker_statuses(),
+            workers_at_hand: u32::try_from(self.registered.len()).unwrap_or(u32::MAX),
+            leases: self.lease_statuses(now_ms),
+            leases_in_force: self.scheduler.progress().leased,
+            attempts: self.task_attempts(),
+            tasks_attempted_again: u32::try_from(self.attempted_again.len()).unwrap_or(u32::MAX),
             quarantined: missing
                 .quarantined
                 .into_iter()
+                .take(BakeStatus::LISTED_MAX)
                 .map(|(task, reason)| QuarantinedTask { task, reason })
                 .collect(),
             tasks_blocked: u32::try_from(missing.blocked.len()).unwrap_or(u32::MAX),
@@ -259,6 +337,7 @@ impl State {
         let leases = self.scheduler.workers();
         self.registered
             .iter()
+            .take(BakeStatus::LISTED_MAX)
             .map(|(id, worker)| WorkerStatus {
                 id: id.0,
                 name: worker.name.clone(),
@@ -267,5 +346,38 @@ impl State {
                 tasks_committed: worker.tasks_committed,
             })
             .collect()
+    }
+
+    /// Leases in force, in the order they were given out.
+    fn lease_statuses(&self, now_ms: u64) -> Vec<LeaseStatus> {
+        let in_force = |id: &LeaseId| self.scheduler.lease_in_force(*id).copied();
+        let given_out = self.given_out.iter().filter_map(|(id, out)| Some((in_force(id)?, out)));
+        given_out
+            .take(BakeStatus::LISTED_MAX)
+            .map(|(lease, out)| LeaseStatus {
+                task: lease.task,
+                lease: lease.id.0,
+                worker: lease.worker.0,
+                worker_name: self.name_of(lease.worker).to_owned(),
+                attempt: out.attempt,
+                age_ms: now_ms.saturating_sub(out.since_ms),
+                usual_ms: self
+                    .usual
+                    .get(self.plan.task(lease.task).kind.name())
+                    .map_or(0, |usual| usual.mean_ms()),
+            })
+            .collect()
+    }
+
+    /// Tasks with more than one attempt, the most attempted first.
+    fn task_attempts(&self) -> Vec<TaskAttempts> {
+        let mut attempts: Vec<TaskAttempts> = self
+            .attempted_again
+            .iter()
+            .map(|(task, attempts)| TaskAttempts { task: *task, attempts: *attempts })
+            .collect();
+        attempts.sort_by_key(|a| (std::cmp::Reverse(a.attempts), a.task));
+        attempts.truncate(BakeStatus::LISTED_MAX);
+        attempts
     }
 }

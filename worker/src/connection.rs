@@ -8,22 +8,16 @@
 use std::time::{Duration, Instant};
 
 use sightline_jobs::FORMAT_VERSION;
-use sightline_proto::v1::coordinator_client::CoordinatorClient;
-use sightline_proto::{MESSAGE_BYTES_MAX, v1};
-use tonic::transport::{Channel, Endpoint};
+use sightline_proto::access::Role;
+use sightline_proto::v1;
 use tonic::{Code, Status};
 
 use crate::WorkerError;
+use crate::security::{Client, ClientSecurity, with_causes};
 
-/// Longest a connection may take, and a call: a lease request waits for a second at most.
-const CONNECT_TIME: Duration = Duration::from_secs(5);
-const CALL_TIME: Duration = Duration::from_secs(20);
 /// First and longest pause between two tries.
 const PAUSE_MIN: Duration = Duration::from_millis(50);
 const PAUSE_MAX: Duration = Duration::from_secs(2);
-
-/// A client of the coordinator.
-pub(crate) type Client = CoordinatorClient<Channel>;
 
 /// A registration with one coordinator.
 #[derive(Clone, Debug)]
@@ -58,7 +52,7 @@ impl From<Status> for CallError {
             | Code::Unauthenticated
             | Code::DataLoss
             | Code::OutOfRange => Self::Refused(status.message().to_owned()),
-            _ => Self::TryAgain(status.message().to_owned()),
+            _ => Self::TryAgain(with_causes(&status)),
         }
     }
 }
@@ -103,18 +97,9 @@ impl Connection {
         name: &str,
         threads: usize,
         patience: Duration,
+        security: &ClientSecurity,
     ) -> Result<Self, WorkerError> {
-        let bad = |problem: String| WorkerError::BadUrl { url: url.to_owned(), problem };
-        let endpoint = Endpoint::from_shared(url.to_owned())
-            .map_err(|error| bad(error.to_string()))?
-            .connect_timeout(CONNECT_TIME)
-            .timeout(CALL_TIME);
-        if endpoint.uri().scheme_str() != Some("http") {
-            return Err(bad("it does not start with http://".into()));
-        }
-        let client = CoordinatorClient::new(endpoint.connect_lazy())
-            .max_decoding_message_size(MESSAGE_BYTES_MAX)
-            .max_encoding_message_size(MESSAGE_BYTES_MAX);
+        let client = security.client(url, Role::Worker)?;
         Ok(Self {
             url: url.to_owned(),
             name: name.to_owned(),
@@ -148,18 +133,9 @@ impl Connection {
             threads: self.threads,
             format_version: FORMAT_VERSION,
             newest_epoch: self.newest.as_ref().map_or(0, |(_, epoch)| *epoch),
+            bake_id: self.newest.as_ref().map_or_else(String::new, |(bake, _)| bake.clone()),
         };
-        let answer = match self.client.register(request).await {
-            Ok(answer) => answer.into_inner(),
-            Err(status) => {
-                let error = CallError::from(status);
-                // It may be of another bake, whose epochs have nothing to do with ours.
-                if matches!(error, CallError::RegisterAgain) && self.is_of_another_bake().await {
-                    self.newest = None;
-                }
-                return Err(error);
-            }
-        };
+        let answer = self.client.register(request).await?.into_inner();
         match &self.newest {
             Some((bake, epoch)) if *bake == answer.bake_id && *epoch > answer.epoch => {
                 return Err(CallError::RegisterAgain);
@@ -175,13 +151,6 @@ impl Connection {
             scene_digest: answer.scene_digest,
             heartbeat: Duration::from_millis(answer.heartbeat_ms.max(1)),
         })
-    }
-
-    async fn is_of_another_bake(&mut self) -> bool {
-        match (self.client.get_status(v1::GetStatusRequest {}).await, &self.newest) {
-            (Ok(status), Some((bake, _))) => status.get_ref().bake_id != *bake,
-            _ => false,
-        }
     }
 
     /// Calls until there is an answer, registering is needed, or the time is up.

@@ -2,6 +2,7 @@
 //!
 //! - [`Worker`]: registers with a coordinator, works until the bake is over.
 //! - [`solve`]: what a task computes; a pure function of scene, plan and the rows it reads.
+//! - [`security`]: how it shows who it is; [`metrics`]: what it counts.
 //!
 //! Solving runs on a thread pool of its own, never on the runtime that talks to the coordinator,
 //! so heartbeats are on time however long a task takes. What a worker may write, and what a crash
@@ -13,10 +14,14 @@ mod cell;
 mod connection;
 mod error;
 mod join;
+pub mod metrics;
 mod pool;
+pub mod security;
 pub mod solve;
 mod weights;
 mod worker;
 
 pub use error::WorkerError;
+pub use metrics::Metrics;
+pub use security::ClientSecurity;
 pub use worker::{Worker, WorkerOptions, WorkerSummary};

@@ -19,13 +19,17 @@ use sightline_jobs::{FailureClass, Plan, TaskId};
 use sightline_proto::{decode_plan, v1};
 use sightline_scene::{OpenOptions, Scene};
 use sightline_store::{BakeStore, keys};
+use sightline_telemetry::trace;
 use tonic::Request;
+use tracing::Instrument;
 
 use crate::WorkerError;
 use crate::attempt::Bake;
-use crate::connection::{CallError, Client, Connection, Session};
+use crate::connection::{CallError, Connection, Session};
 use crate::error::AttemptError;
+use crate::metrics::Metrics;
 use crate::pool::{Cancel, SolvePool};
+use crate::security::{Client, ClientSecurity};
 
 /// How long a goodbye may take.
 const GOODBYE_TIME: Duration = Duration::from_secs(1);
@@ -47,6 +51,10 @@ pub struct WorkerOptions {
     pub name: String,
     /// How long to look for a coordinator that does not answer.
     pub patience: Duration,
+    /// Credentials, and whom to trust.
+    pub security: ClientSecurity,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
 }
 
 impl WorkerOptions {
@@ -61,6 +69,8 @@ impl WorkerOptions {
             threads: 0,
             name: "worker".into(),
             patience: Duration::from_secs(60),
+            security: ClientSecurity::default(),
+            metrics: Arc::default(),
         }
     }
 }
@@ -95,8 +105,13 @@ impl Worker {
         stop: impl Future<Output = ()> + Send,
     ) -> Result<WorkerSummary, WorkerError> {
         let pool = SolvePool::new(options.threads)?;
-        let connection =
-            Connection::new(&options.coordinator, &options.name, pool.threads(), options.patience)?;
+        let connection = Connection::new(
+            &options.coordinator,
+            &options.name,
+            pool.threads(),
+            options.patience,
+            &options.security,
+        )?;
         let mut life =
             Life { options, pool, connection, session: None, summary: WorkerSummary::default() };
         let ended = tokio::select! {
@@ -133,7 +148,13 @@ impl Life {
         let mut bake: Option<Arc<Bake>> = None;
         loop {
             let session = self.connection.register().await?;
-            tracing::info!(bake = session.bake_id, epoch = session.epoch, "registered");
+            tracing::info!(
+                bake = session.bake_id,
+                epoch = session.epoch,
+                worker = session.worker,
+                "registered"
+            );
+            self.options.metrics.registered();
             self.session = Some(session.clone());
             let opened = match bake.take() {
                 Some(bake) if bake.plan.bake_id == session.bake_id => bake,
@@ -160,6 +181,8 @@ impl Life {
             Some(store) => store.clone(),
             None => BakeStore::open(&session.store_location)?,
         };
+        let metrics = self.options.metrics.store.clone();
+        let store = store.observed(Arc::new(move |o| metrics.operation(o.kind, o.result, o.time)));
         let bytes = store.get(&keys::plan(&session.bake_id)).await?;
         let plan = decode_plan(&bytes)
             .map_err(|source| WorkerError::Plan { bake_id: session.bake_id.clone(), source })?;
@@ -212,17 +235,32 @@ impl Life {
             let answer =
                 self.connection.call(async |mut client| client.lease(request).await).await?;
             let answer = match answer {
-                Ok(answer) => answer.into_inner().answer,
+                Ok(answer) => answer,
                 Err(error) => return again_or_refused(error),
             };
-            match answer {
+            let metadata = answer.metadata().clone();
+            match answer.into_inner().answer {
                 Some(v1::lease_response::Answer::Task(task)) => {
                     let leased = Leased {
                         task: TaskId(task.task),
                         lease: task.lease_id,
                         attempt: task.attempt,
                     };
-                    if !self.attempt(session, bake, &leased).await? {
+                    // The life of the task goes on where the coordinator began it.
+                    let span = tracing::info_span!(
+                        "attempt",
+                        bake = session.bake_id,
+                        epoch = session.epoch,
+                        task = leased.task.0,
+                        lease = leased.lease,
+                        attempt = leased.attempt,
+                        worker = session.worker,
+                    );
+                    trace::adopt(&span, &metadata);
+                    self.options.metrics.holds(1);
+                    let goes_on = self.attempt(session, bake, &leased).instrument(span).await;
+                    self.options.metrics.holds(0);
+                    if !goes_on? {
                         return Ok(false);
                     }
                 }
@@ -264,7 +302,7 @@ impl Life {
             never = alive => match never {},
         };
         drop(guard);
-        self.count(leased, &outcome);
+        self.count(leased, bake.plan.task(leased.task).kind.name(), &outcome);
         let result = report_of(&outcome);
         let report = v1::ReportRequest {
             worker_id: session.worker,
@@ -273,8 +311,11 @@ impl Life {
             task: leased.task.0,
             result: Some(result),
         };
-        let sent =
-            self.connection.call(async |mut client| client.report(report.clone()).await).await?;
+        let sent = self
+            .connection
+            .call(async |mut client| client.report(report.clone()).await)
+            .instrument(tracing::info_span!("report"))
+            .await?;
         match sent {
             Ok(_) => Ok(true),
             // The coordinator has answered with a failure of the task.
@@ -287,7 +328,17 @@ impl Life {
         }
     }
 
-    fn count(&mut self, leased: &Leased, outcome: &Result<Duration, AttemptError>) {
+    fn count(
+        &mut self,
+        leased: &Leased,
+        kind: &'static str,
+        outcome: &Result<Duration, AttemptError>,
+    ) {
+        match outcome {
+            Ok(solve_time) => self.options.metrics.committed(kind, *solve_time),
+            Err(AttemptError::GivenUp) => self.options.metrics.given_up(),
+            Err(error) => self.options.metrics.failed(error.class()),
+        }
         match outcome {
             Ok(solve_time) => {
                 tracing::debug!(task = leased.task.0, ?solve_time, "committed");

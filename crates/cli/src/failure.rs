@@ -272,7 +272,9 @@ impl From<CoordinatorError> for Failure {
         let text = error.to_string();
         match error {
             CoordinatorError::Store(error) => error.into(),
-            CoordinatorError::Listen { .. } => Self::new(Kind::Usage, text),
+            CoordinatorError::Listen { .. } | CoordinatorError::Security(_) => {
+                Self::new(Kind::Usage, text)
+            }
             CoordinatorError::PlanDiffers { .. } | CoordinatorError::DamagedState { .. } => {
                 Self::new(Kind::Input, text)
             }
@@ -294,9 +296,9 @@ impl From<WorkerError> for Failure {
         match error {
             WorkerError::Store(error) => error.into(),
             WorkerError::Scene(error) => error.into(),
-            WorkerError::BadUrl { .. } | WorkerError::Threads { .. } => {
-                Self::new(Kind::Usage, text)
-            }
+            WorkerError::BadUrl { .. }
+            | WorkerError::Threads { .. }
+            | WorkerError::Credentials(_) => Self::new(Kind::Usage, text),
             WorkerError::OtherScene { .. }
             | WorkerError::OtherStates { .. }
             | WorkerError::Plan { .. } => Self::new(Kind::Input, text),

@@ -24,6 +24,7 @@ use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt, ObjectStoreScheme, PutMode, PutOptions};
 use url::Url;
 
+use crate::observe::{Observed, Observer};
 use crate::{Result, StoreError, keys};
 
 /// Tasks that race in [`BakeStore::probe`].
@@ -102,6 +103,12 @@ impl BakeStore {
         }
         let files = LocalFileSystem::new_with_prefix(folder).map_err(|e| bad(e.to_string()))?;
         Ok(Self::new(Arc::new(files.with_fsync(true)), Path::default(), location))
+    }
+
+    /// The same store; `observer` is told of every operation.
+    #[must_use]
+    pub fn observed(self, observer: Observer) -> Self {
+        Self { objects: Arc::new(Observed::new(self.objects, observer)), ..self }
     }
 
     /// The location as it was given, for messages.

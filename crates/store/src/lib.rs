@@ -19,6 +19,7 @@ pub mod codec;
 mod error;
 pub mod keys;
 mod manifest;
+mod observe;
 pub mod parts;
 mod publish;
 mod reader;
@@ -36,6 +37,7 @@ pub use manifest::{
     BoxRecord, DataFile, FORMAT, FileKind, Manifest, Pointer, SceneFile, SceneSource, Totals,
     VERSION,
 };
+pub use observe::{Observer, Operation};
 pub use parts::{
     decode_cell_part, decode_object_part, decode_segment_part, decode_segment_part_where,
     encode_cell_part, encode_object_part, encode_segment_part,
