@@ -14,9 +14,7 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use sightline_jobs::{BakeStatus, FailureClass, Phase, TaskKind};
-use sightline_telemetry::metrics::{
-    Label, Labels, Registry, StoreMetrics, duration_buckets,
-};
+use sightline_telemetry::metrics::{Label, Labels, Registry, StoreMetrics, duration_buckets};
 use tonic::Code;
 use tonic::body::Body;
 use tower::{Layer, Service};
@@ -266,7 +264,8 @@ where
             let response = answered.await?;
             // A call that succeeds has its code behind its message, one that fails in the headers.
             let code = response.headers().get("grpc-status");
-            metrics.answered(method, code.map_or(Code::Ok, |code| Code::from_bytes(code.as_bytes())));
+            metrics
+                .answered(method, code.map_or(Code::Ok, |code| Code::from_bytes(code.as_bytes())));
             Ok(response)
         })
     }
@@ -282,7 +281,8 @@ mod tests {
     fn strangers_make_no_series() {
         let (mut registry, metrics) = (Registry::default(), Metrics::default());
         metrics.register(&mut registry);
-        for path in ["/sightline.v1.Coordinator/Evil", "/x", "", "/sightline.v1.Coordinator/Lease"] {
+        for path in ["/sightline.v1.Coordinator/Evil", "/x", "", "/sightline.v1.Coordinator/Lease"]
+        {
             metrics.answered(method_of(path), Code::Unimplemented);
         }
         let text = text_of(&registry);

@@ -21,12 +21,13 @@
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
-use futures::future::{Either, Ready, ready};
+use futures::future::ready;
 use http::{HeaderMap, header};
 use sightline_proto::access::{Roles, Rule, Token, TokenFile, TokenFileError, rule_of};
 use tokio_rustls::TlsAcceptor;
@@ -35,8 +36,8 @@ use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{RootCertStore, ServerConfig};
-use tonic::Status;
 use tonic::body::Body;
+use tonic::{Code, Status};
 use tower::{Layer, Service};
 
 use crate::accept::{ConnectionLimits, Peer};
@@ -237,8 +238,9 @@ impl Gate {
         let mut roles = Roles::ALL;
         if self.asks_for_certificates {
             let of_peer = peer.and_then(|peer| peer.certificate.as_ref());
-            let certificate = of_peer
-                .ok_or_else(|| Status::unauthenticated("this coordinator asks for a certificate"))?;
+            let certificate = of_peer.ok_or_else(|| {
+                Status::unauthenticated("this coordinator asks for a certificate")
+            })?;
             roles = roles.and(certificate.roles);
         }
         if let Some(tokens) = &self.tokens {
@@ -295,7 +297,10 @@ impl RefusalLog {
 
 /// What a stranger sent, fit for a log.
 fn printable(text: &str) -> String {
-    text.chars().take(PATH_BYTES_LOGGED).map(|c| if c.is_ascii_graphic() { c } else { '?' }).collect()
+    text.chars()
+        .take(PATH_BYTES_LOGGED)
+        .map(|c| if c == ' ' || c.is_ascii_graphic() { c } else { '?' })
+        .collect()
 }
 
 #[expect(clippy::unnecessary_wraps, reason = "the type that a token file asks for")]
@@ -314,6 +319,17 @@ fn roles_of(known: &[Known], token: &[u8]) -> Option<Roles> {
         }
     }
     found
+}
+
+/// The answer to a message that is too large or is none, or to a method that there is not: what a
+/// caller of the same version does not send.
+fn unusable(headers: &HeaderMap) -> Option<Status> {
+    let status = Status::from_header_map(headers)?;
+    let is_unusable = matches!(
+        status.code(),
+        Code::OutOfRange | Code::ResourceExhausted | Code::Internal | Code::Unimplemented
+    );
+    is_unusable.then_some(status)
 }
 
 fn bearer(headers: &HeaderMap) -> Option<&[u8]> {
@@ -389,10 +405,12 @@ pub(crate) struct Gated<S> {
 impl<S, B> Service<http::Request<B>> for Gated<S>
 where
     S: Service<http::Request<B>, Response = http::Response<Body>>,
+    S::Future: Send + 'static,
+    S::Error: Send + 'static,
 {
     type Response = S::Response;
     type Error = S::Error;
-    type Future = Either<S::Future, Ready<Result<S::Response, S::Error>>>;
+    type Future = Pin<Box<dyn Future<Output = Result<S::Response, S::Error>> + Send>>;
 
     fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Self::Error>> {
         self.inner.poll_ready(context)
@@ -409,11 +427,20 @@ where
                 {
                     peer.admit();
                 }
-                Either::Left(self.inner.call(request))
+                let (gate, address) = (Arc::clone(&self.gate), peer.map(|peer| peer.address));
+                let path = printable(path);
+                let answered = self.inner.call(request);
+                Box::pin(async move {
+                    let response = answered.await?;
+                    if let Some(status) = unusable(response.headers()) {
+                        gate.refused(address, &path, status.message());
+                    }
+                    Ok(response)
+                })
             }
             Err(status) => {
                 self.gate.refused(peer.map(|peer| peer.address), path, status.message());
-                Either::Right(ready(Ok(status.into_http())))
+                Box::pin(ready(Ok(status.into_http())))
             }
         }
     }
@@ -487,7 +514,7 @@ mod tests {
 
     #[test]
     fn what_strangers_send_is_fit_for_a_log() {
-        assert_eq!(printable("/a b\n\u{1b}[31m\u{e9}"), "/a?b??[31m?");
+        assert_eq!(printable("/a b\n\u{1b}[31m\u{e9}"), "/a b??[31m?");
         assert_eq!(printable(&"x".repeat(1000)).len(), PATH_BYTES_LOGGED);
     }
 }

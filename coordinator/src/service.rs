@@ -110,7 +110,7 @@ impl Service {
                 task = lease.task.0,
                 lease = lease.id.0,
                 attempt,
-                worker = state.name_of(worker),
+                worker = worker.0,
                 "leased"
             );
             self.0.metrics.leased();
@@ -132,7 +132,7 @@ impl Service {
         let found = self.0.journal.commit(task).await;
         match found {
             Ok(Some(_)) => {
-                let kind = self.0.state().plan.task(task).kind.clone();
+                let kind = self.0.state().plan.task(task).kind;
                 self.0.metrics.committed(&kind, solve_ms);
                 self.0.change(|state, _| state.committed(task, Some((worker, solve_ms))));
                 Ok(())
@@ -176,7 +176,7 @@ impl Service {
                 tracing::warn!(
                     task = task.0,
                     lease = lease.0,
-                    worker = name,
+                    worker = worker.0,
                     ?class,
                     reason,
                     "an attempt failed"
@@ -274,8 +274,15 @@ impl coordinator_server::Coordinator for Service {
                 return Err(Status::resource_exhausted("too many workers are registered"));
             }
             let name = shortened(request.worker_name, NAME_BYTES_MAX);
-            tracing::info!(worker = %name, threads = request.threads, "a worker joins");
-            let worker = state.join(name, request.threads, now_ms);
+            let worker = state.join(name.clone(), request.threads, now_ms);
+            tracing::info!(
+                bake = state.plan.bake_id,
+                epoch = state.epoch,
+                worker = worker.0,
+                name,
+                threads = request.threads,
+                "a worker joins"
+            );
             state.own(worker, caller);
             Ok(Response::new(v1::RegisterResponse {
                 worker_id: worker.0,
@@ -356,7 +363,7 @@ impl coordinator_server::Coordinator for Service {
         let request = request.into_inner();
         let worker = self.admit(request.epoch, request.worker_id, caller)?;
         self.0.change(|state, _| {
-            tracing::info!(worker = state.name_of(worker), "a worker leaves");
+            tracing::info!(worker = worker.0, name = state.name_of(worker), "a worker leaves");
             state.leave(worker);
         });
         Ok(Response::new(v1::GoodbyeResponse {}))

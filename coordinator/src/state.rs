@@ -31,8 +31,8 @@ struct Usual {
 }
 
 impl Usual {
-    const fn mean_ms(self) -> u64 {
-        if self.tasks == 0 { 0 } else { self.solve_ms / self.tasks }
+    fn mean_ms(self) -> u64 {
+        self.solve_ms.checked_div(self.tasks).unwrap_or(0)
     }
 }
 

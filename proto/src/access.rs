@@ -234,7 +234,9 @@ pub fn parse_tokens(path: &Path, text: &str) -> Result<Vec<(Roles, Token)>, Toke
             )));
         }
         if !token.bytes().all(|b| b.is_ascii_graphic()) {
-            return Err(bad("a token is letters, digits and signs of ASCII, without spaces".into()));
+            return Err(
+                bad("a token is letters, digits and signs of ASCII, without spaces".into()),
+            );
         }
         tokens.push((roles, Token(token.to_owned())));
     }
@@ -243,6 +245,9 @@ pub fn parse_tokens(path: &Path, text: &str) -> Result<Vec<(Roles, Token)>, Toke
     }
     Ok(tokens)
 }
+
+/// What a token file is read for: from its path, for messages, and its tokens.
+pub type Make<T> = fn(&Path, Vec<(Roles, Token)>) -> Result<T, TokenFileError>;
 
 /// Tells versions of a file apart.
 type Stamp = (Option<SystemTime>, u64);
@@ -258,7 +263,7 @@ struct Read<T> {
 /// be used any more leaves what was there before.
 pub struct TokenFile<T> {
     path: PathBuf,
-    make: fn(&Path, Vec<(Roles, Token)>) -> Result<T, TokenFileError>,
+    make: Make<T>,
     read: Mutex<Read<T>>,
 }
 
@@ -273,10 +278,7 @@ impl<T> TokenFile<T> {
     ///
     /// # Errors
     /// When the file cannot be read or used.
-    pub fn open(
-        path: &Path,
-        make: fn(&Path, Vec<(Roles, Token)>) -> Result<T, TokenFileError>,
-    ) -> Result<Self, TokenFileError> {
+    pub fn open(path: &Path, make: Make<T>) -> Result<Self, TokenFileError> {
         let (stamp, content) = read_file(path, make)?;
         let read = Read { looked: Instant::now(), stamp, content: Arc::new(content) };
         Ok(Self { path: path.to_owned(), make, read: Mutex::new(read) })
@@ -307,10 +309,7 @@ fn stamp_of(path: &Path) -> std::io::Result<Stamp> {
     Ok((found.modified().ok(), found.len()))
 }
 
-fn read_file<T>(
-    path: &Path,
-    make: fn(&Path, Vec<(Roles, Token)>) -> Result<T, TokenFileError>,
-) -> Result<(Stamp, T), TokenFileError> {
+fn read_file<T>(path: &Path, make: Make<T>) -> Result<(Stamp, T), TokenFileError> {
     let failed = |source| TokenFileError::Read { path: path.to_owned(), source };
     // The stamp comes first: a change while reading is seen at the next look.
     let stamp = stamp_of(path).map_err(failed)?;

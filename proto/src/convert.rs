@@ -4,9 +4,9 @@ use glam::DVec3;
 use prost::Message;
 use sightline_geometry::{CellId, SegmentId, ViewCell, ViewSegment};
 use sightline_jobs::{
-    BakeConfig, BakeStatus, ConfigError, Done, FORMAT_VERSION, FailureClass, LeaseStatus, Phase, Plan,
-    PlannedCell, Progress, QuarantinedTask, SceneFile, SceneRef, SkippedCells, StateRange, Task,
-    TaskId, TaskKind, TaskAttempts, WorkerStatus,
+    BakeConfig, BakeStatus, ConfigError, Done, FORMAT_VERSION, FailureClass, LeaseStatus, Phase,
+    Plan, PlannedCell, Progress, QuarantinedTask, SceneFile, SceneRef, SkippedCells, StateRange,
+    Task, TaskAttempts, TaskId, TaskKind, WorkerStatus,
 };
 
 use crate::v1;
@@ -352,8 +352,7 @@ impl From<&BakeStatus> for v1::Status {
             age_ms: l.age_ms,
             usual_ms: l.usual_ms,
         };
-        let attempts =
-            |a: &TaskAttempts| v1::TaskAttempts { task: a.task.0, attempts: a.attempts };
+        let attempts = |a: &TaskAttempts| v1::TaskAttempts { task: a.task.0, attempts: a.attempts };
         Self {
             bake_id: s.bake_id.clone(),
             epoch: s.epoch,

@@ -3,8 +3,11 @@
 //! that are skipped loudly when this machine lacks them.
 
 pub mod binaries;
+pub mod campaign;
+pub mod certificates;
 pub mod city;
 pub mod dataset;
+pub mod fuzzing;
 pub mod process;
 pub mod requirement;
 pub mod scenes;

@@ -12,7 +12,9 @@ use sightline_store::{ErrorClass, StoreError};
 #[non_exhaustive]
 pub enum WorkerError {
     /// The coordinator's address is not a URL.
-    #[error("`{url}` is not the URL of a coordinator: {problem}; write http://HOST:PORT or https://HOST:PORT")]
+    #[error(
+        "`{url}` is not the URL of a coordinator: {problem}; write http://HOST:PORT or https://HOST:PORT"
+    )]
     BadUrl {
         /// The URL as given.
         url: String,

@@ -60,7 +60,7 @@ fn main() -> ExitCode {
                 failures = summary.failures,
                 solve_ms,
                 published = summary.published,
-                message = summary.message,
+                end = summary.message,
                 "done"
             );
             ExitCode::SUCCESS

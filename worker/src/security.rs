@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use sightline_proto::MESSAGE_BYTES_MAX;
 use sightline_proto::access::{Role, Token, TokenFile, TokenFileError, token_for};
 use sightline_proto::v1::coordinator_client::CoordinatorClient;
-use sightline_proto::MESSAGE_BYTES_MAX;
 use sightline_telemetry::trace;
 use tonic::metadata::AsciiMetadataValue;
 use tonic::service::Interceptor;
@@ -85,8 +85,12 @@ impl ClientSecurity {
             _ => return Err(bad("it starts neither with http:// nor with https://".into())),
         }
         let make = match role {
-            Role::Worker => |path: &Path, tokens| header(&token_for(Role::Worker, path, tokens)?, path),
-            Role::Viewer => |path: &Path, tokens| header(&token_for(Role::Viewer, path, tokens)?, path),
+            Role::Worker => {
+                |path: &Path, tokens| header(&token_for(Role::Worker, path, tokens)?, path)
+            }
+            Role::Viewer => {
+                |path: &Path, tokens| header(&token_for(Role::Viewer, path, tokens)?, path)
+            }
         };
         let token = self.token_file.as_deref().map(|path| TokenFile::open(path, make));
         let token = token.transpose().map_err(|error| refused(error.to_string()))?;
@@ -132,10 +136,8 @@ fn refused(problem: String) -> WorkerError {
 
 fn header(token: &Token, path: &Path) -> Result<AsciiMetadataValue, TokenFileError> {
     let value = AsciiMetadataValue::try_from(format!("Bearer {}", token.reveal()));
-    let mut value = value.map_err(|_| TokenFileError::NoToken {
-        path: path.to_owned(),
-        role: "visible ASCII",
-    })?;
+    let mut value = value
+        .map_err(|_| TokenFileError::NoToken { path: path.to_owned(), role: "visible ASCII" })?;
     // Left out of what HTTP/2 keeps in its tables, and of `Debug`.
     value.set_sensitive(true);
     Ok(value)
@@ -146,7 +148,8 @@ fn read(path: &Path) -> Result<Vec<u8>, WorkerError> {
 }
 
 /// An error with what it comes from: transport errors say little by themselves.
-pub(crate) fn with_causes(error: &dyn std::error::Error) -> String {
+#[must_use]
+pub fn with_causes(error: &dyn std::error::Error) -> String {
     let causes = std::iter::successors(error.source(), |cause| cause.source());
     let mut text = error.to_string();
     for cause in causes {
@@ -200,7 +203,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = with_token(folder.path()).token_file.unwrap();
         let make = |path: &Path, tokens| header(&token_for(Role::Worker, path, tokens)?, path);
-        let credentials = Credentials { token: Some(Arc::new(TokenFile::open(&path, make).unwrap())) };
+        let credentials =
+            Credentials { token: Some(Arc::new(TokenFile::open(&path, make).unwrap())) };
         let mut request = credentials.clone();
         let request = request.call(Request::new(())).unwrap();
         assert!(request.metadata().contains_key("authorization"));

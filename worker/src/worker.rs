@@ -268,7 +268,7 @@ impl Life {
                     tokio::time::sleep(Duration::from_millis(wait.retry_after_ms)).await;
                 }
                 Some(v1::lease_response::Answer::Finished(finished)) => {
-                    tracing::info!(message = finished.message, "the bake is over");
+                    tracing::info!(end = finished.message, "the bake is over");
                     self.summary.published = finished.published;
                     self.summary.message = finished.message;
                     return Ok(true);

@@ -5,7 +5,7 @@
 //! - [`metrics`]: a small HTTP listener for Prometheus, and the metrics that all processes share.
 //! - [`trace`]: the life of a task as spans, exported by OTLP when a collector is named, with one
 //!   trace across processes.
-//! - [`stop`]: signals.
+//! - [`stop`] waits for signals.
 //!
 //! It knows nothing of bakes: coordinator and worker register their own metrics and make their own
 //! spans.

@@ -3,7 +3,7 @@
 //! What is logged is chosen by `RUST_LOG`, else by the program's default. Text is for people; JSON
 //! has an object a line, with the fields of the event and of the span that it is in.
 
-use std::io;
+use std::io::{self, IsTerminal};
 use std::net::SocketAddr;
 
 use opentelemetry::trace::TracerProvider;
@@ -72,7 +72,10 @@ impl Telemetry {
         let filter =
             EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(options.filter));
         let lines = match options.format {
-            LogFormat::Text => tracing_subscriber::fmt::layer().with_writer(writer).boxed(),
+            LogFormat::Text => tracing_subscriber::fmt::layer()
+                .with_ansi(io::stderr().is_terminal())
+                .with_writer(writer)
+                .boxed(),
             LogFormat::Json => tracing_subscriber::fmt::layer()
                 .json()
                 .flatten_event(true)

@@ -201,7 +201,8 @@ mod tests {
         store.register(&mut registry);
         store.operation("get", "ok", Duration::from_millis(5));
         let listener = Listener::start(([127, 0, 0, 1], 0).into(), registry).await.unwrap();
-        let get = |path: &str| format!("GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n");
+        let get =
+            |path: &str| format!("GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n");
         let metrics = ask(listener.address, &get("/metrics")).await;
         assert!(metrics.starts_with("HTTP/1.1 200") && metrics.contains(CONTENT_TYPE), "{metrics}");
         let counted = "sightline_store_operations_total{operation=\"get\",result=\"ok\"} 1";

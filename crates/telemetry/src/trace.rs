@@ -44,7 +44,7 @@ impl Export {
     /// Starts an export if the environment names a collector.
     pub fn from_environment(service: &'static str) -> Result<Option<Self>, TraceError> {
         let is_set = |name: &&str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
-        if !ENDPOINTS.iter().any(|name| is_set(&name)) {
+        if !ENDPOINTS.iter().any(is_set) {
             return Ok(None);
         }
         let failed = |problem: String| TraceError { problem };
