@@ -17,7 +17,7 @@
 //! - AC-3: no secret is logged. Tokens are compared as BLAKE3 hashes, which takes the same time
 //!   whatever is alike, and only the hashes stay in memory.
 //!
-//! Connections are limited in [`crate::accept`].
+//! Connections are limited in the module `accept`.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};

@@ -13,7 +13,7 @@ use sightline_proto::v1;
 use tonic::{Code, Status};
 
 use crate::WorkerError;
-use crate::security::{Client, ClientSecurity, with_causes};
+use crate::security::{Client, ClientSecurity, told};
 
 /// First and longest pause between two tries.
 const PAUSE_MIN: Duration = Duration::from_millis(50);
@@ -52,7 +52,7 @@ impl From<Status> for CallError {
             | Code::Unauthenticated
             | Code::DataLoss
             | Code::OutOfRange => Self::Refused(status.message().to_owned()),
-            _ => Self::TryAgain(with_causes(&status)),
+            _ => Self::TryAgain(told(&status)),
         }
     }
 }

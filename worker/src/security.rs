@@ -79,8 +79,7 @@ impl ClientSecurity {
             Some("http") => self.check_plain(endpoint.uri().host().unwrap_or_default())?,
             Some("https") => {
                 let tls = self.tls()?;
-                endpoint =
-                    endpoint.tls_config(tls).map_err(|error| refused(with_causes(&error)))?;
+                endpoint = endpoint.tls_config(tls).map_err(|error| refused(error.to_string()))?;
             }
             _ => return Err(bad("it starts neither with http:// nor with https://".into())),
         }
@@ -147,14 +146,18 @@ fn read(path: &Path) -> Result<Vec<u8>, WorkerError> {
     std::fs::read(path).map_err(|error| refused(format!("{}: {error}", path.display())))
 }
 
-/// An error with what it comes from: transport errors say little by themselves.
+/// What a call was answered with: its message, and what that comes from. Transport errors say
+/// little by themselves.
 #[must_use]
-pub fn with_causes(error: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(error.source(), |cause| cause.source());
-    let mut text = error.to_string();
-    for cause in causes {
+pub fn told(status: &Status) -> String {
+    let mut text = match status.message() {
+        "" => status.code().to_string(),
+        message => message.to_owned(),
+    };
+    let first = std::error::Error::source(status);
+    for cause in std::iter::successors(first, |cause| cause.source()) {
         let more = cause.to_string();
-        if !text.ends_with(&more) {
+        if !text.contains(&more) {
             text = format!("{text}: {more}");
         }
     }

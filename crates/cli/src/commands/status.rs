@@ -75,7 +75,7 @@ fn failure(url: &str, status: &tonic::Status) -> Failure {
             (Kind::Network, "check that a coordinator runs there, and --tls-ca if it asks for TLS")
         }
     };
-    let told = sightline_worker::security::with_causes(status);
+    let told = sightline_worker::security::told(status);
     Failure::new(kind, format!("{url} does not tell its status: {told}")).with_help(help)
 }
 
