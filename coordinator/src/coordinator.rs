@@ -12,18 +12,19 @@ use futures::Stream;
 use sightline_jobs::{BakeStatus, Outcome, Phase, Plan, SchedulePolicy, pause_ms};
 use sightline_proto::v1::coordinator_server::CoordinatorServer;
 use sightline_proto::{MESSAGE_BYTES_MAX, v1};
-use sightline_store::BakeStore;
+use sightline_store::{BakeStore, Operation};
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{Notify, oneshot, watch};
 use tokio::task::JoinHandle;
-use tokio_stream::wrappers::TcpListenerStream;
-use tonic::transport::server::Connected;
 
 use crate::CoordinatorError;
+use crate::accept::connections;
 use crate::clock::{Clock, MonotonicClock};
 use crate::dataset::Publish;
 use crate::journal::Journal;
+use crate::metrics::{CountLayer, Metrics};
+use crate::security::{Gate, GateLayer, SecurityOptions};
 use crate::service::{Service, Shared};
 use crate::state::State;
 
@@ -34,11 +35,20 @@ const DRAIN_TIME: Duration = Duration::from_secs(2);
 /// First and longest pause while the store does not answer, ms.
 const OUTAGE_PAUSE_MS: u64 = 200;
 const OUTAGE_PAUSE_MS_MAX: u64 = 10_000;
-/// How often an idle connection is asked whether its other end still lives, and how long that may take
-/// to answer. A machine that loses its power closes no connection.
-const KEEPALIVE: Duration = Duration::from_secs(10);
 /// Time between two looks for a newer epoch in the store, ms.
 const EPOCH_CHECK_MS: u64 = 5_000;
+/// The same when somebody spoke of a newer epoch: who says so again and again costs little.
+const EPOCH_DOUBT_MS: u64 = 500;
+/// Calls that a connection may have in flight.
+const STREAMS_MAX: u32 = 256;
+/// Longest time until a call is answered, or its answer begins.
+const REQUEST_TIME: Duration = Duration::from_secs(30);
+/// Largest headers of a call, bytes.
+const HEADER_BYTES_MAX: u32 = 16 << 10;
+/// A connection on which nothing is heard for as long is asked whether it is alive, and has so long
+/// to answer.
+const KEEPALIVE_EVERY: Duration = Duration::from_secs(10);
+const KEEPALIVE_TIME: Duration = Duration::from_secs(10);
 
 /// How to run a bake.
 pub struct CoordinatorOptions {
@@ -62,6 +72,13 @@ pub struct CoordinatorOptions {
     pub patience: Duration,
     /// Tells coordinators that race for an epoch apart: no two may have the same.
     pub name: String,
+    /// Who may talk to the coordinator.
+    pub security: SecurityOptions,
+    /// Where to answer health checks without encryption, beside the service itself: probes have no
+    /// certificates.
+    pub health: Option<SocketAddr>,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
 }
 
 impl CoordinatorOptions {
@@ -84,6 +101,9 @@ impl CoordinatorOptions {
             clock: Arc::new(MonotonicClock::default()),
             patience: Duration::from_secs(300),
             name: unique_name(),
+            security: SecurityOptions::default(),
+            health: None,
+            metrics: Arc::default(),
         }
     }
 }
@@ -106,6 +126,7 @@ pub struct Coordinator;
 pub struct CoordinatorHandle {
     /// Where it listens.
     pub addr: SocketAddr,
+    is_encrypted: bool,
     status: watch::Receiver<BakeStatus>,
     stop: Option<oneshot::Sender<()>>,
     end: JoinHandle<Result<Summary, CoordinatorError>>,
@@ -127,7 +148,8 @@ impl CoordinatorHandle {
     /// The address for workers on this machine, as a URL.
     #[must_use]
     pub fn url(&self) -> String {
-        format!("http://{}", self.addr)
+        let scheme = if self.is_encrypted { "https" } else { "http" };
+        format!("{scheme}://{}", self.addr)
     }
 
     /// The status, now and at every change.
@@ -164,13 +186,10 @@ impl Coordinator {
     /// # Errors
     /// When the store breaks its promises, holds another plan, or cannot be listened for.
     pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, CoordinatorError> {
-        let listener = TcpListener::bind(options.listen)
-            .await
-            .map_err(|source| CoordinatorError::Listen { address: options.listen, source })?;
-        let addr = listener
-            .local_addr()
-            .map_err(|source| CoordinatorError::Listen { address: options.listen, source })?;
-        Self::start_on(options, TcpListenerStream::new(listener), addr).await
+        // Refused before anything is opened.
+        Gate::new(&options.security, options.listen, Arc::clone(&options.metrics))?;
+        let (listener, addr) = listen(options.listen).await?;
+        Self::start_on(options, stream_of(listener), addr).await
     }
 
     /// As [`Coordinator::start`], with connections that were accepted elsewhere; `addr` is where workers
@@ -179,13 +198,22 @@ impl Coordinator {
     /// # Errors
     /// As [`Coordinator::start`].
     pub async fn start_on<IO>(
-        options: CoordinatorOptions,
-        incoming: impl Stream<Item = std::io::Result<IO>> + Send + 'static,
+        mut options: CoordinatorOptions,
+        accepted: impl Stream<Item = std::io::Result<(IO, SocketAddr)>> + Send + 'static,
         addr: SocketAddr,
     ) -> Result<CoordinatorHandle, CoordinatorError>
     where
-        IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+        IO: AsyncRead + AsyncWrite + Unpin + Send + 'static,
     {
+        let counted = options.metrics.store.clone();
+        let observer = Arc::new(move |o: Operation| counted.operation(o.kind, o.result, o.time));
+        options.store = options.store.observed(observer);
+        let gate = Gate::new(&options.security, options.listen, Arc::clone(&options.metrics))?;
+        let gate = Arc::new(gate);
+        let probes = match options.health {
+            Some(address) => Some(listen(address).await?),
+            None => None,
+        };
         let mut outage = Outage::new(options.patience);
         let (shared, status) = loop {
             match open_bake(&options, addr).await {
@@ -195,10 +223,13 @@ impl Coordinator {
         };
         let (stop, stopped) = oneshot::channel();
         let (stop_server, server_stopped) = oneshot::channel();
-        let server = tokio::spawn(serve(incoming, Arc::clone(&shared), server_stopped));
+        let is_encrypted = gate.tls().is_some();
+        let probes = probes.map(|(listener, _)| HealthListener::start(listener, &gate));
+        let server = tokio::spawn(serve(accepted, Arc::clone(&shared), gate, server_stopped));
         let audited = Arc::clone(&shared);
         let run = Run { shared, options, addr, epoch_checked_ms: 0 };
         let end = tokio::spawn(async move {
+            let _probes = probes;
             let end = run.drive(stopped).await;
             let _ = stop_server.send(());
             match server.await {
@@ -207,8 +238,16 @@ impl Coordinator {
                 Err(error) => end.and(Err(CoordinatorError::Defect(error.to_string()))),
             }
         });
-        Ok(CoordinatorHandle { addr, status, stop: Some(stop), end, shared: audited })
+        let stop = Some(stop);
+        Ok(CoordinatorHandle { addr, is_encrypted, status, stop, end, shared: audited })
     }
+}
+
+async fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), CoordinatorError> {
+    let failed = |source| CoordinatorError::Listen { address, source };
+    let listener = TcpListener::bind(address).await.map_err(failed)?;
+    let bound = listener.local_addr().map_err(failed)?;
+    Ok((listener, bound))
 }
 
 /// The steps of [`crate::journal`].
@@ -245,6 +284,7 @@ async fn open_bake(
         store_location: absolute(store.location()),
         scene_uri: absolute(&plan.scene.uri),
         lease_ms: policy.lease_ms,
+        metrics: Arc::clone(&options.metrics),
     };
     Ok((Arc::new(shared), watched))
 }
@@ -269,25 +309,28 @@ fn absolute(location: &str) -> String {
 }
 
 async fn serve<IO>(
-    incoming: impl Stream<Item = std::io::Result<IO>>,
+    accepted: impl Stream<Item = std::io::Result<(IO, SocketAddr)>> + Send + 'static,
     shared: Arc<Shared>,
+    gate: Arc<Gate>,
     stopped: oneshot::Receiver<()>,
 ) -> Result<(), Box<dyn std::error::Error + Send + Sync>>
 where
-    IO: AsyncRead + AsyncWrite + Connected + Unpin + Send + 'static,
+    IO: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<CoordinatorServer<Service>>().await;
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
         .build_v1()?;
+    let counts = CountLayer(shared.metrics.as_ref().clone());
     let service = CoordinatorServer::new(Service(shared))
         .max_decoding_message_size(MESSAGE_BYTES_MAX)
         .max_encoding_message_size(MESSAGE_BYTES_MAX);
     let (draining, drain) = oneshot::channel();
-    let server = tonic::transport::Server::builder()
-        .http2_keepalive_interval(Some(KEEPALIVE))
-        .http2_keepalive_timeout(Some(KEEPALIVE))
+    let incoming = connections(accepted, Arc::clone(&gate));
+    let server = limited()
+        .layer(counts)
+        .layer(GateLayer(gate))
         .add_service(health_service)
         .add_service(reflection)
         .add_service(service)
@@ -338,6 +381,54 @@ impl Outage {
         self.tries += 1;
         tokio::time::sleep(Duration::from_millis(pause)).await;
         Ok(())
+    }
+}
+
+/// A server that nobody can make hold more than a bounded amount, and that notices who is gone.
+fn limited() -> tonic::transport::Server {
+    tonic::transport::Server::builder()
+        .max_concurrent_streams(STREAMS_MAX)
+        .concurrency_limit_per_connection(STREAMS_MAX as usize)
+        .timeout(REQUEST_TIME)
+        .http2_max_header_list_size(HEADER_BYTES_MAX)
+        .http2_keepalive_interval(Some(KEEPALIVE_EVERY))
+        .http2_keepalive_timeout(Some(KEEPALIVE_TIME))
+        .tcp_keepalive(Some(KEEPALIVE_EVERY))
+}
+
+/// Accepted connections with their addresses.
+fn stream_of(
+    listener: TcpListener,
+) -> impl futures::Stream<Item = std::io::Result<(TcpStream, SocketAddr)>> + Send {
+    futures::stream::unfold(listener, |listener| async move {
+        let accepted = listener.accept().await.and_then(|(stream, address)| {
+            stream.set_nodelay(true)?;
+            Ok((stream, address))
+        });
+        Some((accepted, listener))
+    })
+}
+
+/// Answers health checks and nothing else, in plain text; stops when it is dropped.
+struct HealthListener(JoinHandle<()>);
+
+impl HealthListener {
+    fn start(listener: TcpListener, gate: &Gate) -> Self {
+        let open = Arc::new(gate.without_credentials());
+        Self(tokio::spawn(async move {
+            let (health, service) = tonic_health::server::health_reporter();
+            health.set_serving::<CoordinatorServer<Service>>().await;
+            let incoming = connections(stream_of(listener), open);
+            if let Err(error) = limited().add_service(service).serve_with_incoming(incoming).await {
+                tracing::warn!(%error, "health is not answered any more");
+            }
+        }))
+    }
+}
+
+impl Drop for HealthListener {
+    fn drop(&mut self) {
+        self.0.abort();
     }
 }
 
@@ -440,7 +531,13 @@ impl Run {
         let now_ms = self.shared.clock.now_ms();
         let lost = self.shared.state().tick(now_ms);
         for lease in &lost {
-            tracing::warn!(task = lease.task.0, worker = %lease.worker, "a lease ran out");
+            self.shared.metrics.lease_lost();
+            tracing::warn!(
+                task = lease.task.0,
+                lease = lease.id.0,
+                worker = %lease.worker,
+                "a lease ran out"
+            );
             if self.shared.journal.commit(lease.task).await?.is_some() {
                 self.shared.change(|state, now_ms| state.committed(lease.task, None, now_ms));
             }
@@ -455,7 +552,9 @@ impl Run {
 
     async fn check_epoch(&mut self) -> Result<(), CoordinatorError> {
         let now_ms = self.shared.clock.now_ms();
-        if now_ms.saturating_sub(self.epoch_checked_ms) >= EPOCH_CHECK_MS {
+        let since_ms = now_ms.saturating_sub(self.epoch_checked_ms);
+        let is_in_doubt = since_ms >= EPOCH_DOUBT_MS && self.shared.state().take_doubt();
+        if is_in_doubt || since_ms >= EPOCH_CHECK_MS {
             self.epoch_checked_ms = now_ms;
             let newest = self.shared.journal.newest_epoch().await?;
             self.shared.state().see_epoch(newest);

@@ -6,6 +6,8 @@ use sightline_jobs::{Missing, TaskId};
 use sightline_proto::ConvertError;
 use sightline_store::{ErrorClass, StoreError};
 
+use crate::security::SecurityError;
+
 /// Why a coordinator ended without a dataset.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -21,6 +23,9 @@ pub enum CoordinatorError {
         /// What the system says.
         source: std::io::Error,
     },
+    /// The coordinator cannot be secured as asked, or would be open to all.
+    #[error(transparent)]
+    Security(#[from] SecurityError),
     /// The store holds another plan under this bake's id.
     #[error(
         "{location} holds another plan under the id of this bake, {bake_id}: it was made by \

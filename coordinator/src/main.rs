@@ -8,11 +8,14 @@ use std::time::Duration;
 
 use clap::Parser;
 use sightline_coordinator::{
-    Coordinator, CoordinatorOptions, Prepared, ShareScene, Summary, fetch_scene, prepare_from,
-    share_scene,
+    Coordinator, CoordinatorOptions, Prepared, SecurityFlags, ShareScene, Summary, fetch_scene,
+    prepare_from, share_scene,
 };
 use sightline_jobs::BakeConfig;
 use sightline_store::{BakeStore, ByteSize, FileCache, local_path};
+use sightline_telemetry::metrics::{Listener, Registry};
+use sightline_telemetry::stop::signalled;
+use sightline_telemetry::{LogOptions, Telemetry, WatchFlags};
 
 /// Plans a bake, leases its tasks to workers, publishes the dataset.
 #[derive(Debug, Parser)]
@@ -48,16 +51,30 @@ struct Arguments {
     /// Limit of that folder, such as 20GiB or 500MB.
     #[arg(long, value_name = "SIZE", default_value = "20GiB", env = "SIGHTLINE_CACHE_SIZE")]
     cache_size: ByteSize,
+    #[command(flatten)]
+    security: SecurityFlags,
+    /// Answer health checks there in plain text, and nothing else: for probes, which have no
+    /// certificates.
+    #[arg(long, value_name = "HOST:PORT", env = "SIGHTLINE_HEALTH")]
+    health: Option<SocketAddr>,
+    #[command(flatten)]
+    watch: WatchFlags,
 }
 
 type Error = Box<dyn std::error::Error + Send + Sync>;
 
-#[tokio::main]
-async fn main() -> ExitCode {
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
-    match run(Arguments::parse()).await {
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let format = arguments.watch.log_format;
+    let logs = LogOptions { format, filter: "info", service: "sightline-coordinator" };
+    let telemetry = Telemetry::to_stderr(logs);
+    let runtime = tokio::runtime::Runtime::new().map_err(Error::from);
+    let ended = match (&telemetry, runtime) {
+        (Err(error), _) => Err(error.to_string().into()),
+        (_, Err(error)) => Err(error),
+        (Ok(_), Ok(runtime)) => runtime.block_on(run(arguments)),
+    };
+    match ended {
         Ok(summary) => {
             tracing::info!(
                 manifest = summary.manifest,
@@ -107,6 +124,14 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
 
     let mut options = CoordinatorOptions::new(arguments.listen, store, plan, Arc::new(publisher));
     options.policy.lease_ms = arguments.lease_ms;
+    options.security = arguments.security.into();
+    options.health = arguments.health;
+    let mut registry = Registry::default();
+    options.metrics.register(&mut registry);
+    let _listener = match arguments.watch.metrics {
+        Some(address) => Some(Listener::start(address, registry).await?),
+        None => None,
+    };
     options.worker_wait = arguments.worker_wait.map(Duration::from_secs);
     let mut coordinator = Coordinator::start(options).await?;
     let mut status = coordinator.status();
@@ -116,23 +141,4 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
         () = signalled() => coordinator.shutdown(),
     }
     Ok(coordinator.join().await?)
-}
-
-/// Until someone asks the process to stop.
-async fn signalled() {
-    #[cfg(unix)]
-    {
-        use tokio::signal::unix::{SignalKind, signal};
-        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
-            tokio::select! {
-                _ = terminate.recv() => {}
-                _ = tokio::signal::ctrl_c() => {}
-            }
-            return;
-        }
-    }
-    // Without a handler the default action applies: the process ends.
-    if tokio::signal::ctrl_c().await.is_err() {
-        std::future::pending::<()>().await;
-    }
 }

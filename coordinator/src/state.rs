@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use sightline_jobs::{
-    BakeStatus, FailureClass, Lease, LeaseId, Outcome, Phase, Plan, QuarantinedTask,
-    SchedulePolicy, Scheduler, TaskId, TaskKind, WorkerId, WorkerStatus,
+    BakeStatus, FailureClass, Lease, LeaseId, LeaseStatus, Outcome, Phase, Plan, QuarantinedTask,
+    SchedulePolicy, Scheduler, TaskAttempts, TaskId, TaskKind, WorkerId, WorkerStatus,
 };
 
 /// A registered worker.
@@ -52,8 +52,13 @@ pub(crate) struct State {
     ending: Option<Ending>,
     /// The coordinator ends and the bake does not: workers are to look for the next one.
     is_closed: bool,
-    /// The newest epoch that anybody showed us, when it is newer than ours.
+    /// The newest epoch in the store, when it is newer than ours.
     newer_epoch: Option<u64>,
+    /// Somebody showed us a newer epoch; only the store is believed.
+    is_epoch_in_doubt: bool,
+    /// Certificates of those who registered with one.
+    owners: BTreeMap<WorkerId, blake3::Hash>,
+    attempted_again: BTreeMap<TaskId, u32>,
 }
 
 impl State {
@@ -77,6 +82,9 @@ impl State {
             ending: None,
             is_closed: false,
             newer_epoch: None,
+            is_epoch_in_doubt: false,
+            owners: BTreeMap::new(),
+            attempted_again: BTreeMap::new(),
         }
     }
 
@@ -130,7 +138,17 @@ impl State {
         self.ending.clone()
     }
 
-    /// Notes an epoch that somebody showed us.
+    /// Somebody says that there is this epoch. Anybody can say so: the coordinator looks.
+    pub const fn hear_of_epoch(&mut self, epoch: u64) {
+        self.is_epoch_in_doubt |= epoch > self.epoch;
+    }
+
+    /// Whether somebody spoke of a newer epoch since the last time.
+    pub const fn take_doubt(&mut self) -> bool {
+        std::mem::replace(&mut self.is_epoch_in_doubt, false)
+    }
+
+    /// Notes an epoch that is in the store.
     pub fn see_epoch(&mut self, epoch: u64) {
         if epoch > self.epoch {
             self.newer_epoch = self.newer_epoch.max(Some(epoch));
@@ -152,6 +170,21 @@ impl State {
         self.scheduler.knows(worker)
     }
 
+    /// Binds a worker to the certificate it registered with.
+    pub fn own(&mut self, worker: WorkerId, owner: Option<blake3::Hash>) {
+        self.owners.extend(owner.map(|owner| (worker, owner)));
+    }
+
+    /// True when a caller with this certificate may speak for the worker.
+    pub fn is_owned_by(&self, worker: WorkerId, caller: Option<blake3::Hash>) -> bool {
+        self.owners.get(&worker).is_none_or(|owner| caller == Some(*owner))
+    }
+
+    /// True when the worker holds the lease.
+    pub fn holds(&self, worker: WorkerId, lease: LeaseId) -> bool {
+        self.scheduler.lease_in_force(lease).is_some_and(|lease| lease.worker == worker)
+    }
+
     pub fn name_of(&self, worker: WorkerId) -> &str {
         self.registered.get(&worker).map_or("?", |w| w.name.as_str())
     }
@@ -159,6 +192,7 @@ impl State {
     pub fn leave(&mut self, worker: WorkerId) {
         self.scheduler.leave(worker);
         self.registered.remove(&worker);
+        self.owners.remove(&worker);
     }
 
     pub fn worker_count(&self) -> usize {
@@ -167,7 +201,12 @@ impl State {
 
     pub fn lease(&mut self, worker: WorkerId, now_ms: u64) -> Option<Lease> {
         self.scheduler.heartbeat(worker, &[], now_ms);
-        (self.phase == Phase::Solving).then(|| self.scheduler.lease(worker, now_ms)).flatten()
+        let solves = self.phase == Phase::Solving;
+        let lease = solves.then(|| self.scheduler.lease(worker, now_ms)).flatten()?;
+        if lease.attempt > 1 {
+            self.attempted_again.insert(lease.task, lease.attempt);
+        }
+        Some(lease)
     }
 
     pub fn heartbeat(&mut self, worker: WorkerId, held: &[LeaseId], now_ms: u64) -> Vec<LeaseId> {
@@ -176,7 +215,8 @@ impl State {
 
     /// A task's commit object exists; `by` tells who reported it.
     pub fn committed(&mut self, task: TaskId, by: Option<&Reported>, now_ms: u64) {
-        let is_news = self.scheduler.committed(task, by.map(|r| r.lease), now_ms);
+        let held = by.filter(|r| self.holds(r.worker, r.lease)).map(|r| r.lease);
+        let is_news = self.scheduler.committed(task, held, now_ms);
         if let Some(reported) = by {
             self.worker_solve_ms += reported.solve_ms;
             if let Some(worker) = self.registered.get_mut(&reported.worker).filter(|_| is_news) {
@@ -204,6 +244,7 @@ impl State {
         let lost = self.scheduler.expire(now_ms);
         let scheduler = &self.scheduler;
         self.registered.retain(|worker, _| scheduler.knows(*worker));
+        self.owners.retain(|worker, _| scheduler.knows(*worker));
         if self.worker_count() > 0 {
             self.workers_seen_ms = now_ms;
         }
@@ -218,11 +259,6 @@ impl State {
     /// True when a waiting worker may get a task that it could not get before the last tick.
     pub fn has_work(&self) -> bool {
         self.phase == Phase::Solving && self.scheduler.has_work()
-    }
-
-    /// The worker that holds a lease.
-    pub fn holder(&self, lease: LeaseId) -> Option<WorkerId> {
-        self.scheduler.lease_in_force(lease).map(|lease| lease.worker)
     }
 
     /// Panics with the first invariant that does not hold.
@@ -254,9 +290,15 @@ impl State {
             joins,
             tasks_resumed: self.tasks_resumed,
             workers: self.worker_statuses(),
+            workers_at_hand: u32::try_from(self.registered.len()).unwrap_or(u32::MAX),
+            leases: self.lease_statuses(now_ms),
+            leases_in_force: self.scheduler.progress().leased,
+            attempts: self.task_attempts(),
+            tasks_attempted_again: u32::try_from(self.attempted_again.len()).unwrap_or(u32::MAX),
             quarantined: missing
                 .quarantined
                 .into_iter()
+                .take(BakeStatus::LISTED_MAX)
                 .map(|(task, reason)| QuarantinedTask { task, reason })
                 .collect(),
             tasks_blocked: u32::try_from(missing.blocked.len()).unwrap_or(u32::MAX),
@@ -281,6 +323,7 @@ impl State {
         let leases = self.scheduler.workers();
         self.registered
             .iter()
+            .take(BakeStatus::LISTED_MAX)
             .map(|(id, worker)| WorkerStatus {
                 id: id.0,
                 name: worker.name.clone(),
@@ -289,5 +332,34 @@ impl State {
                 tasks_committed: worker.tasks_committed,
             })
             .collect()
+    }
+
+    /// Leases in force, in the order they were given out.
+    fn lease_statuses(&self, now_ms: u64) -> Vec<LeaseStatus> {
+        self.scheduler
+            .leases()
+            .take(BakeStatus::LISTED_MAX)
+            .map(|lease| LeaseStatus {
+                task: lease.task,
+                lease: lease.id.0,
+                worker: lease.worker.0,
+                worker_name: self.name_of(lease.worker).to_owned(),
+                attempt: lease.attempt,
+                age_ms: now_ms.saturating_sub(lease.since_ms),
+                usual_ms: self.scheduler.predicted_ms(lease.task).unwrap_or(0),
+            })
+            .collect()
+    }
+
+    /// Tasks with more than one attempt, the most attempted first.
+    fn task_attempts(&self) -> Vec<TaskAttempts> {
+        let mut attempts: Vec<TaskAttempts> = self
+            .attempted_again
+            .iter()
+            .map(|(task, attempts)| TaskAttempts { task: *task, attempts: *attempts })
+            .collect();
+        attempts.sort_by_key(|a| (std::cmp::Reverse(a.attempts), a.task));
+        attempts.truncate(BakeStatus::LISTED_MAX);
+        attempts
     }
 }

@@ -169,6 +169,7 @@ fn registration(newest_epoch: u64) -> v1::RegisterRequest {
         threads: 1,
         format_version: FORMAT_VERSION,
         newest_epoch,
+        bake_id: String::new(),
     }
 }
 

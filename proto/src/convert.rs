@@ -4,9 +4,9 @@ use glam::DVec3;
 use prost::Message;
 use sightline_geometry::{CellId, SegmentId, ViewCell, ViewSegment};
 use sightline_jobs::{
-    BakeConfig, BakeStatus, ConfigError, Done, FORMAT_VERSION, FailureClass, Phase, Plan,
-    PlannedCell, Progress, QuarantinedTask, SceneFile, SceneRef, SkippedCells, StateRange, Task,
-    TaskId, TaskKind, WorkerStatus,
+    BakeConfig, BakeStatus, ConfigError, Done, FORMAT_VERSION, FailureClass, LeaseStatus, Phase,
+    Plan, PlannedCell, Progress, QuarantinedTask, SceneFile, SceneRef, SkippedCells, StateRange,
+    Task, TaskAttempts, TaskId, TaskKind, WorkerStatus,
 };
 
 use crate::v1;
@@ -343,6 +343,16 @@ impl From<&BakeStatus> for v1::Status {
         };
         let quarantined =
             |q: &QuarantinedTask| v1::QuarantinedTask { task: q.task.0, reason: q.reason.clone() };
+        let lease = |l: &LeaseStatus| v1::LeaseStatus {
+            task: l.task.0,
+            lease: l.lease,
+            worker: l.worker,
+            worker_name: l.worker_name.clone(),
+            attempt: l.attempt,
+            age_ms: l.age_ms,
+            usual_ms: l.usual_ms,
+        };
+        let attempts = |a: &TaskAttempts| v1::TaskAttempts { task: a.task.0, attempts: a.attempts };
         Self {
             bake_id: s.bake_id.clone(),
             epoch: s.epoch,
@@ -353,6 +363,11 @@ impl From<&BakeStatus> for v1::Status {
             joins: Some(s.joins.into()),
             tasks_resumed: s.tasks_resumed,
             workers: s.workers.iter().map(worker).collect(),
+            workers_at_hand: s.workers_at_hand,
+            leases: s.leases.iter().map(lease).collect(),
+            leases_in_force: s.leases_in_force,
+            attempts: s.attempts.iter().map(attempts).collect(),
+            tasks_attempted_again: s.tasks_attempted_again,
             quarantined: s.quarantined.iter().map(quarantined).collect(),
             tasks_blocked: s.tasks_blocked,
             elapsed_ms: s.elapsed_ms,
@@ -379,6 +394,17 @@ impl TryFrom<v1::Status> for BakeStatus {
         };
         let quarantined =
             |q: v1::QuarantinedTask| QuarantinedTask { task: TaskId(q.task), reason: q.reason };
+        let lease = |l: v1::LeaseStatus| LeaseStatus {
+            task: TaskId(l.task),
+            lease: l.lease,
+            worker: l.worker,
+            worker_name: l.worker_name,
+            attempt: l.attempt,
+            age_ms: l.age_ms,
+            usual_ms: l.usual_ms,
+        };
+        let attempts =
+            |a: v1::TaskAttempts| TaskAttempts { task: TaskId(a.task), attempts: a.attempts };
         let phase = m.phase().try_into()?;
         Ok(Self {
             bake_id: m.bake_id,
@@ -390,6 +416,11 @@ impl TryFrom<v1::Status> for BakeStatus {
             joins: m.joins.ok_or(missing("Status", "joins"))?.into(),
             tasks_resumed: m.tasks_resumed,
             workers: m.workers.into_iter().map(worker).collect(),
+            workers_at_hand: m.workers_at_hand,
+            leases: m.leases.into_iter().map(lease).collect(),
+            leases_in_force: m.leases_in_force,
+            attempts: m.attempts.into_iter().map(attempts).collect(),
+            tasks_attempted_again: m.tasks_attempted_again,
             quarantined: m.quarantined.into_iter().map(quarantined).collect(),
             tasks_blocked: m.tasks_blocked,
             elapsed_ms: m.elapsed_ms,
@@ -517,6 +548,19 @@ mod tests {
                 leases: 1,
                 tasks_committed: 4,
             }],
+            workers_at_hand: 300,
+            leases: vec![LeaseStatus {
+                task: TaskId(2),
+                lease: 7,
+                worker: 1,
+                worker_name: "w".into(),
+                attempt: 3,
+                age_ms: 5,
+                usual_ms: 6,
+            }],
+            leases_in_force: 301,
+            attempts: vec![TaskAttempts { task: TaskId(2), attempts: 3 }],
+            tasks_attempted_again: 302,
             quarantined: vec![QuarantinedTask { task: TaskId(4), reason: "it broke".into() }],
             tasks_blocked: 2,
             elapsed_ms: 1,

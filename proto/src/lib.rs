@@ -3,6 +3,7 @@
 //! Promise: what converts without an error is well formed. Messages come from other processes
 //! and stored files, so a missing or impossible field is a [`ConvertError`], never a panic.
 
+pub mod access;
 mod convert;
 
 pub use convert::{ConvertError, decode_plan, encode_plan};
@@ -17,6 +18,6 @@ pub mod v1 {
         include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 }
 
-/// Largest message that either side of the protocol accepts, bytes. The largest are statuses:
-/// some 100 bytes a worker and a quarantined task.
+/// Largest message that either side of the protocol accepts, bytes. The largest are statuses, whose
+/// lists are bounded: a quarantined task comes with a reason of several kB at most.
 pub const MESSAGE_BYTES_MAX: usize = 4 << 20;

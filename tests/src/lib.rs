@@ -3,14 +3,17 @@
 //! that are skipped loudly when this machine lacks them.
 
 pub mod binaries;
+pub mod campaign;
+pub mod certificates;
 pub mod city;
 pub mod conformance;
 pub mod dataset;
 pub mod flaky_proxy;
+pub mod fuzzing;
 pub mod process;
 pub mod requirement;
 pub mod scenes;
-pub mod simulation;
 pub mod servers;
+pub mod simulation;
 pub mod sources;
 pub mod workspace;

@@ -60,6 +60,12 @@ impl Process {
         self.child.try_wait().expect("the state of a child can be read").is_none()
     }
 
+    /// The number of the process.
+    #[must_use]
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// What the process has written to stderr so far.
     #[must_use]
     pub fn stderr(&self) -> String {

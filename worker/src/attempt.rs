@@ -19,6 +19,7 @@ use sightline_store::{
     BakeStore, CellRow, Created, PartKind, SegmentRow, decode_cell_part, decode_segment_part_where,
     encode_cell_part, encode_object_part, encode_segment_part, keys,
 };
+use tracing::Instrument;
 
 use crate::cache::PartCache;
 use crate::compute::{Compute, Computed, Part};
@@ -61,19 +62,29 @@ impl Bake {
         attempt: &str,
         cancel: &Cancel,
     ) -> Result<Duration, AttemptError> {
-        let inputs = match self.plan.task(task).kind {
-            TaskKind::Segments { .. } => Inputs::Nothing,
-            TaskKind::Cells { .. } => Inputs::Segments(self.read_segments(task).await?),
-            TaskKind::Join { .. } => Inputs::Ranges(self.read_ranges(task).await?),
-        };
+        let inputs = self.read(task).instrument(tracing::info_span!("read")).await?;
         let (bake, cancelled) = (Arc::clone(self), cancel.clone());
-        let job = Box::new(move || bake.compute(task, &inputs, &cancelled));
+        let span = tracing::info_span!("solve");
+        let job = Box::new(move || {
+            let _solving = span.enter();
+            bake.compute(task, &inputs, &cancelled)
+        });
         let Computed { parts, took } = self.compute.compute(task, job).await?;
         if cancel.is_cancelled() {
             return Err(AttemptError::GivenUp);
         }
-        self.write(task, attempt, parts).await?;
+        let write = tracing::info_span!("write");
+        let parts = self.write_parts(task, attempt, parts).instrument(write).await?;
+        self.commit(task, attempt, parts).instrument(tracing::info_span!("commit")).await?;
         Ok(took)
+    }
+
+    async fn read(&self, task: TaskId) -> Result<Inputs, AttemptError> {
+        Ok(match self.plan.task(task).kind {
+            TaskKind::Segments { .. } => Inputs::Nothing,
+            TaskKind::Cells { .. } => Inputs::Segments(self.read_segments(task).await?),
+            TaskKind::Join { .. } => Inputs::Ranges(self.read_ranges(task).await?),
+        })
     }
 
     /// Solves and encodes. Runs on the solving threads.
@@ -109,13 +120,13 @@ impl Bake {
         Ok(parts)
     }
 
-    /// Steps 1 and 2 of an attempt: the parts, then the commit.
-    async fn write(
+    /// Step 1 of an attempt: the parts.
+    async fn write_parts(
         &self,
         task: TaskId,
         attempt: &str,
         parts: Vec<Part>,
-    ) -> Result<(), AttemptError> {
+    ) -> Result<Vec<v1::CommittedPart>, AttemptError> {
         let bake_id = &self.plan.bake_id;
         let mut committed = Vec::with_capacity(parts.len());
         for (kind, part) in parts {
@@ -133,8 +144,18 @@ impl Bake {
             }
             committed.push(v1::CommittedPart { key, bytes, digest });
         }
-        let commit = v1::Commit { task: task.0, attempt: attempt.to_owned(), parts: committed };
-        let key = keys::commit(bake_id, task.0);
+        Ok(committed)
+    }
+
+    /// Step 2: the commit.
+    async fn commit(
+        &self,
+        task: TaskId,
+        attempt: &str,
+        parts: Vec<v1::CommittedPart>,
+    ) -> Result<(), AttemptError> {
+        let commit = v1::Commit { task: task.0, attempt: attempt.to_owned(), parts };
+        let key = keys::commit(&self.plan.bake_id, task.0);
         if self.store.create(&key, commit.encode_to_vec()).await? == Created::AlreadyThere {
             tracing::info!(task = task.0, attempt, "another attempt committed first");
         }

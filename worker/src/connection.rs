@@ -9,29 +9,17 @@ use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::time::Duration;
 
 use sightline_jobs::{FORMAT_VERSION, pause_ms};
-use sightline_proto::v1::coordinator_client::CoordinatorClient;
-use sightline_proto::{MESSAGE_BYTES_MAX, v1};
+use sightline_proto::access::Role;
+use sightline_proto::v1;
 use tokio::time::Instant;
-use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status};
 
 use crate::WorkerError;
+use crate::security::{Client, ClientSecurity, Dial, told};
 
-/// Longest a connection may take, and a call: a lease request waits for a second at most.
-const CONNECT_TIME: Duration = Duration::from_secs(5);
-const CALL_TIME: Duration = Duration::from_secs(20);
-/// How often a silent connection is asked whether its other end still lives, and how long that may take
-/// to answer. A machine that loses its power closes no connection.
-const KEEPALIVE: Duration = Duration::from_secs(10);
 /// First and longest pause between two tries.
 const PAUSE_MS: u64 = 100;
 const PAUSE_MS_MAX: u64 = 5_000;
-
-/// How to get from an address to a connection; for tests in which the network is simulated.
-pub type Dial = std::sync::Arc<dyn Fn(&Endpoint) -> Channel + Send + Sync>;
-
-/// A client of the coordinator.
-pub(crate) type Client = CoordinatorClient<Channel>;
 
 /// A registration with one coordinator.
 #[derive(Clone, Debug)]
@@ -66,7 +54,7 @@ impl From<Status> for CallError {
             | Code::Unauthenticated
             | Code::DataLoss
             | Code::OutOfRange => Self::Refused(status.message().to_owned()),
-            _ => Self::TryAgain(status.message().to_owned()),
+            _ => Self::TryAgain(told(&status)),
         }
     }
 }
@@ -116,23 +104,10 @@ impl Connection {
         name: &str,
         threads: usize,
         patience: Duration,
+        security: &ClientSecurity,
         dial: Option<&Dial>,
     ) -> Result<Self, WorkerError> {
-        let bad = |problem: String| WorkerError::BadUrl { url: url.to_owned(), problem };
-        let endpoint = Endpoint::from_shared(url.to_owned())
-            .map_err(|error| bad(error.to_string()))?
-            .connect_timeout(CONNECT_TIME)
-            .timeout(CALL_TIME)
-            .http2_keep_alive_interval(KEEPALIVE)
-            .keep_alive_timeout(KEEPALIVE)
-            .keep_alive_while_idle(true);
-        if endpoint.uri().scheme_str() != Some("http") {
-            return Err(bad("it does not start with http://".into()));
-        }
-        let channel = dial.map_or_else(|| endpoint.connect_lazy(), |dial| dial(&endpoint));
-        let client = CoordinatorClient::new(channel)
-            .max_decoding_message_size(MESSAGE_BYTES_MAX)
-            .max_encoding_message_size(MESSAGE_BYTES_MAX);
+        let client = security.client_over(url, Role::Worker, dial)?;
         Ok(Self {
             url: url.to_owned(),
             name: name.to_owned(),
@@ -166,18 +141,9 @@ impl Connection {
             threads: self.threads,
             format_version: FORMAT_VERSION,
             newest_epoch: self.newest.as_ref().map_or(0, |(_, epoch)| *epoch),
+            bake_id: self.newest.as_ref().map_or_else(String::new, |(bake, _)| bake.clone()),
         };
-        let answer = match self.client.register(request).await {
-            Ok(answer) => answer.into_inner(),
-            Err(status) => {
-                let error = CallError::from(status);
-                // It may be of another bake, whose epochs have nothing to do with ours.
-                if matches!(error, CallError::RegisterAgain) && self.is_of_another_bake().await {
-                    self.newest = None;
-                }
-                return Err(error);
-            }
-        };
+        let answer = self.client.register(request).await?.into_inner();
         match &self.newest {
             Some((bake, epoch)) if *bake == answer.bake_id && *epoch > answer.epoch => {
                 return Err(CallError::RegisterAgain);
@@ -193,13 +159,6 @@ impl Connection {
             scene_digest: answer.scene_digest,
             heartbeat: Duration::from_millis(answer.heartbeat_ms.max(1)),
         })
-    }
-
-    async fn is_of_another_bake(&mut self) -> bool {
-        match (self.client.get_status(v1::GetStatusRequest {}).await, &self.newest) {
-            (Ok(status), Some((bake, _))) => status.get_ref().bake_id != *bake,
-            _ => false,
-        }
     }
 
     /// Calls until there is an answer, registering is needed, or the time is up.

@@ -12,13 +12,18 @@ use sightline_store::{ErrorClass, StoreError};
 #[non_exhaustive]
 pub enum WorkerError {
     /// The coordinator's address is not a URL.
-    #[error("`{url}` is not the URL of a coordinator: {problem}; write http://HOST:PORT")]
+    #[error(
+        "`{url}` is not the URL of a coordinator: {problem}; write http://HOST:PORT or https://HOST:PORT"
+    )]
     BadUrl {
         /// The URL as given.
         url: String,
         /// What is wrong with it.
         problem: String,
     },
+    /// Certificates or tokens cannot be used, or would be given away.
+    #[error("{0}")]
+    Credentials(String),
     /// The coordinator does not answer.
     #[error(
         "no coordinator answered at {url} for {} s: {problem}; check that one is running and \

@@ -6,7 +6,10 @@ use std::time::Duration;
 
 use clap::Parser;
 use sightline_store::{BakeStore, ByteSize};
-use sightline_worker::{SceneAccess, Worker, WorkerOptions, WorkerSummary};
+use sightline_telemetry::metrics::{Listener, Registry};
+use sightline_telemetry::stop::signalled;
+use sightline_telemetry::{LogOptions, Telemetry, WatchFlags};
+use sightline_worker::{ClientSecurity, SceneAccess, Worker, WorkerOptions, WorkerSummary};
 
 /// Leases tasks from a coordinator, solves them, writes the results.
 #[derive(Debug, Parser)]
@@ -40,16 +43,26 @@ struct Arguments {
     /// How long to look for a coordinator that does not answer, s.
     #[arg(long, default_value_t = 60, value_name = "SECONDS")]
     patience: u64,
+    #[command(flatten)]
+    security: ClientSecurity,
+    #[command(flatten)]
+    watch: WatchFlags,
 }
 
 type Error = Box<dyn std::error::Error + Send + Sync>;
 
-#[tokio::main]
-async fn main() -> ExitCode {
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
-    match run(Arguments::parse()).await {
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let format = arguments.watch.log_format;
+    let logs = LogOptions { format, filter: "info", service: "sightline-worker" };
+    let telemetry = Telemetry::to_stderr(logs);
+    let runtime = tokio::runtime::Runtime::new().map_err(Error::from);
+    let ended = match (&telemetry, runtime) {
+        (Err(error), _) => Err(error.to_string().into()),
+        (_, Err(error)) => Err(error),
+        (Ok(_), Ok(runtime)) => runtime.block_on(run(arguments)),
+    };
+    match ended {
         Ok(summary) => {
             let solve_ms = u64::try_from(summary.solve_time.as_millis()).unwrap_or(u64::MAX);
             tracing::info!(
@@ -57,7 +70,7 @@ async fn main() -> ExitCode {
                 failures = summary.failures,
                 solve_ms,
                 published = summary.published,
-                message = summary.message,
+                end = summary.message,
                 "done"
             );
             ExitCode::SUCCESS
@@ -81,24 +94,12 @@ async fn run(arguments: Arguments) -> Result<WorkerSummary, Error> {
     options.threads = arguments.threads;
     options.name = arguments.name;
     options.patience = Duration::from_secs(arguments.patience);
+    options.security = arguments.security;
+    let mut registry = Registry::default();
+    options.metrics.register(&mut registry);
+    let _listener = match arguments.watch.metrics {
+        Some(address) => Some(Listener::start(address, registry).await?),
+        None => None,
+    };
     Ok(Worker::run(options, signalled()).await?)
-}
-
-/// Until someone asks the process to stop.
-async fn signalled() {
-    #[cfg(unix)]
-    {
-        use tokio::signal::unix::{SignalKind, signal};
-        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
-            tokio::select! {
-                _ = terminate.recv() => {}
-                _ = tokio::signal::ctrl_c() => {}
-            }
-            return;
-        }
-    }
-    // Without a handler the default action applies: the process ends.
-    if tokio::signal::ctrl_c().await.is_err() {
-        std::future::pending::<()>().await;
-    }
 }

@@ -19,16 +19,20 @@ use sightline_jobs::{FailureClass, Plan, TaskId};
 use sightline_proto::{decode_plan, v1};
 use sightline_scene::{OpenOptions, Scene};
 use sightline_store::{BakeStore, ErrorClass, keys};
+use sightline_telemetry::trace;
 use tokio::sync::watch;
 use tonic::Request;
+use tracing::Instrument;
 
 use crate::WorkerError;
 use crate::attempt::Bake;
 use crate::compute::Compute;
-use crate::connection::{CallError, Client, Connection, Dial, Pauses, Session};
+use crate::connection::{CallError, Connection, Pauses, Session};
 use crate::error::AttemptError;
+use crate::metrics::Metrics;
 use crate::pool::{Cancel, SolvePool};
 use crate::scene_files::{self, SceneAccess};
+use crate::security::{Client, ClientSecurity, Dial};
 
 /// How long a goodbye may take.
 const GOODBYE_TIME: Duration = Duration::from_secs(1);
@@ -58,6 +62,10 @@ pub struct WorkerOptions {
     pub compute: Option<Arc<dyn Compute>>,
     /// How to connect to the coordinator; by TCP when `None`.
     pub dial: Option<Dial>,
+    /// Credentials, and whom to trust.
+    pub security: ClientSecurity,
+    /// What is counted.
+    pub metrics: Arc<Metrics>,
 }
 
 impl WorkerOptions {
@@ -76,6 +84,8 @@ impl WorkerOptions {
             drain: Duration::ZERO,
             compute: None,
             dial: None,
+            security: ClientSecurity::default(),
+            metrics: Arc::default(),
         }
     }
 }
@@ -111,9 +121,10 @@ impl Worker {
         stop: impl Future<Output = ()> + Send,
     ) -> Result<WorkerSummary, WorkerError> {
         let pool = SolvePool::new(options.threads)?;
-        let WorkerOptions { patience, drain, dial, .. } = &options;
+        let WorkerOptions { patience, drain, dial, security, .. } = &options;
         let (url, name, drain) = (&options.coordinator, &options.name, *drain);
-        let connection = Connection::new(url, name, pool.threads(), *patience, dial.as_ref())?;
+        let connection =
+            Connection::new(url, name, pool.threads(), *patience, security, dial.as_ref())?;
         let (stopping, stopped) = watch::channel(false);
         let mut life = Life {
             options,
@@ -185,7 +196,13 @@ impl Life {
     /// Registers, and opens the bake unless it is the one at hand.
     async fn begin(&mut self, at_hand: Option<Arc<Bake>>) -> Result<Arc<Bake>, WorkerError> {
         let session = self.connection.register().await?;
-        tracing::info!(bake = session.bake_id, epoch = session.epoch, "registered");
+        tracing::info!(
+            bake = session.bake_id,
+            epoch = session.epoch,
+            worker = session.worker,
+            "registered"
+        );
+        self.options.metrics.registered();
         self.session = Some(session.clone());
         match at_hand {
             Some(bake) if bake.plan.bake_id == session.bake_id => Ok(bake),
@@ -224,6 +241,8 @@ impl Life {
             Some(store) => store.clone(),
             None => BakeStore::open(&session.store_location)?,
         };
+        let metrics = self.options.metrics.store.clone();
+        let store = store.observed(Arc::new(move |o| metrics.operation(o.kind, o.result, o.time)));
         let bytes = store.get(&keys::plan(&session.bake_id)).await?;
         let plan = decode_plan(&bytes)
             .map_err(|source| WorkerError::Plan { bake_id: session.bake_id.clone(), source })?;
@@ -301,17 +320,32 @@ impl Life {
                 }
             };
             let answer = match answer {
-                Ok(answer) => answer.into_inner().answer,
+                Ok(answer) => answer,
                 Err(error) => return again_or_refused(error),
             };
-            match answer {
+            let metadata = answer.metadata().clone();
+            match answer.into_inner().answer {
                 Some(v1::lease_response::Answer::Task(task)) => {
                     let leased = Leased {
                         task: TaskId(task.task),
                         lease: task.lease_id,
                         attempt: task.attempt,
                     };
-                    if !self.attempt(&session, bake, &leased).await? {
+                    // The life of the task goes on where the coordinator began it.
+                    let span = tracing::info_span!(
+                        "attempt",
+                        bake = session.bake_id,
+                        epoch = session.epoch,
+                        task = leased.task.0,
+                        lease = leased.lease,
+                        attempt = leased.attempt,
+                        worker = session.worker,
+                    );
+                    trace::adopt(&span, &metadata);
+                    self.options.metrics.holds(1);
+                    let goes_on = self.attempt(&session, bake, &leased).instrument(span).await;
+                    self.options.metrics.holds(0);
+                    if !goes_on? {
                         return Ok(false);
                     }
                 }
@@ -319,7 +353,7 @@ impl Life {
                     tokio::time::sleep(Duration::from_millis(wait.retry_after_ms)).await;
                 }
                 Some(v1::lease_response::Answer::Finished(finished)) => {
-                    tracing::info!(message = finished.message, "the bake is over");
+                    tracing::info!(end = finished.message, "the bake is over");
                     self.summary.published = finished.published;
                     self.summary.message = finished.message;
                     self.is_over = true;
@@ -355,7 +389,7 @@ impl Life {
             never = alive => match never {},
         };
         drop(guard);
-        self.count(leased, &outcome);
+        self.count(leased, bake.plan.task(leased.task).kind.name(), &outcome);
         let result = report_of(&outcome);
         let report = v1::ReportRequest {
             worker_id: session.worker,
@@ -364,8 +398,11 @@ impl Life {
             task: leased.task.0,
             result: Some(result),
         };
-        let sent =
-            self.connection.call(async |mut client| client.report(report.clone()).await).await?;
+        let sent = self
+            .connection
+            .call(async |mut client| client.report(report.clone()).await)
+            .instrument(tracing::info_span!("report"))
+            .await?;
         match sent {
             Ok(_) => Ok(true),
             // The coordinator has answered with a failure of the task.
@@ -378,7 +415,17 @@ impl Life {
         }
     }
 
-    fn count(&mut self, leased: &Leased, outcome: &Result<Duration, AttemptError>) {
+    fn count(
+        &mut self,
+        leased: &Leased,
+        kind: &'static str,
+        outcome: &Result<Duration, AttemptError>,
+    ) {
+        match outcome {
+            Ok(solve_time) => self.options.metrics.committed(kind, *solve_time),
+            Err(AttemptError::GivenUp) => self.options.metrics.given_up(),
+            Err(error) => self.options.metrics.failed(error.class()),
+        }
         match outcome {
             Ok(solve_time) => {
                 tracing::debug!(task = leased.task.0, ?solve_time, "committed");

@@ -6,10 +6,12 @@
 use std::path::PathBuf;
 
 use clap::{ArgAction, ArgMatches, Args, Command, FromArgMatches, Parser, Subcommand, ValueEnum};
-use sightline_coordinator::ShareScene;
+use sightline_coordinator::{SecurityFlags, ShareScene};
 use sightline_geometry::CellId;
 use sightline_jobs::{KEYS, KeyDoc};
 use sightline_store::{ByteSize, CACHE_BYTES_MAX};
+use sightline_telemetry::{LogFormat, WatchFlags};
+use sightline_worker::ClientSecurity;
 
 /// Precomputed visibility for large 3D worlds: which triangles can be seen from where.
 #[derive(Debug, Parser)]
@@ -40,6 +42,8 @@ pub enum Task {
     Coordinator(Box<Coordinator>),
     /// Work for a coordinator until its bake is done.
     Worker(Worker),
+    /// Show how a bake is doing, or what is stored of it.
+    Status(Box<Status>),
     /// Measure the pixel error of a dataset by casting rays through the full scene.
     Verify(Verify),
     /// Write what is visible from one cell as glTF.
@@ -53,6 +57,24 @@ pub enum Task {
 }
 
 impl Task {
+    /// How log lines look.
+    pub fn log_format(&self) -> LogFormat {
+        match self {
+            Self::Coordinator(c) => c.watch.log_format,
+            Self::Worker(c) => c.watch.log_format,
+            _ => LogFormat::Text,
+        }
+    }
+
+    /// Name of the process in traces.
+    pub const fn service(&self) -> &'static str {
+        match self {
+            Self::Coordinator(_) => "sightline-coordinator",
+            Self::Worker(_) => "sightline-worker",
+            _ => "sightline",
+        }
+    }
+
     /// True when the result is wanted as JSON.
     pub fn wants_json(&self) -> bool {
         match self {
@@ -62,6 +84,7 @@ impl Task {
             Self::Export(c) => c.json,
             Self::Info(c) => c.json,
             Self::Cell(c) => c.json,
+            Self::Status(c) => c.json,
             Self::Coordinator(_) | Self::Worker(_) | Self::Demo(_) => false,
         }
     }
@@ -181,6 +204,16 @@ pub struct Coordinator {
     /// always, never, or when the store is an object store (auto).
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     pub share_scene: ShareScene,
+    /// Who may talk to it.
+    #[command(flatten)]
+    pub security: SecurityFlags,
+    /// Answer health checks there in plain text, and nothing else: for probes, which have no
+    /// certificates.
+    #[arg(long, value_name = "HOST:PORT", env = "SIGHTLINE_HEALTH")]
+    pub health: Option<std::net::SocketAddr>,
+    /// How it can be watched.
+    #[command(flatten)]
+    pub watch: WatchFlags,
 }
 
 /// `worker`.
@@ -205,6 +238,33 @@ pub struct Worker {
     /// Threads; all cores when absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
+    /// Credentials.
+    #[command(flatten)]
+    pub security: ClientSecurity,
+    /// How it can be watched.
+    #[command(flatten)]
+    pub watch: WatchFlags,
+}
+
+/// `status`.
+#[derive(Debug, Args)]
+pub struct Status {
+    /// URL of a coordinator, such as http://127.0.0.1:7070; or the location of a dataset, to see
+    /// what is stored.
+    #[arg(value_name = "URL|DATASET")]
+    pub of: String,
+    /// Show it once and end, on a terminal too.
+    #[arg(long, conflicts_with = "watch")]
+    pub once: bool,
+    /// Show it at every change until the bake ends; so it does on a terminal.
+    #[arg(long)]
+    pub watch: bool,
+    /// Print one JSON object, with --watch one a line.
+    #[arg(long)]
+    pub json: bool,
+    /// Credentials.
+    #[command(flatten)]
+    pub security: ClientSecurity,
 }
 
 /// A dataset and its scene.

@@ -289,7 +289,9 @@ impl From<CoordinatorError> for Failure {
         let text = error.to_string();
         match error {
             CoordinatorError::Store(error) => error.into(),
-            CoordinatorError::Listen { .. } => Self::new(Kind::Usage, text),
+            CoordinatorError::Listen { .. } | CoordinatorError::Security(_) => {
+                Self::new(Kind::Usage, text)
+            }
             CoordinatorError::PlanDiffers { .. } | CoordinatorError::DamagedState { .. } => {
                 Self::new(Kind::Input, text)
             }
@@ -311,9 +313,9 @@ impl From<WorkerError> for Failure {
         match error {
             WorkerError::Store(error) => error.into(),
             WorkerError::Scene(error) => error.into(),
-            WorkerError::BadUrl { .. } | WorkerError::Threads { .. } => {
-                Self::new(Kind::Usage, text)
-            }
+            WorkerError::BadUrl { .. }
+            | WorkerError::Threads { .. }
+            | WorkerError::Credentials(_) => Self::new(Kind::Usage, text),
             WorkerError::NoScene { .. }
             | WorkerError::OtherScene { .. }
             | WorkerError::OtherStates { .. }

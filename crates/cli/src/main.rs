@@ -13,18 +13,23 @@ mod report;
 use std::process::ExitCode;
 
 use clap::Parser;
-use tracing_subscriber::EnvFilter;
+use sightline_telemetry::trace::TraceError;
+use sightline_telemetry::{LogOptions, Telemetry};
 
 use arguments::Arguments;
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    start_logging(&arguments);
+    let telemetry = start_telemetry(&arguments);
     if arguments.quiet {
         progress::be_quiet();
     }
     let json = arguments.command.wants_json();
-    match commands::run(arguments.command) {
+    let ended = match &telemetry {
+        Ok(_) => commands::run(arguments.command),
+        Err(error) => Err(failure::Failure::new(failure::Kind::Usage, error.to_string())),
+    };
+    match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
             // A negative answer is an answer: the command has printed it.
@@ -48,13 +53,13 @@ fn show(failure: failure::Failure) {
     progress::always(text.trim_end());
 }
 
-fn start_logging(arguments: &Arguments) {
+fn start_telemetry(arguments: &Arguments) -> Result<Telemetry, TraceError> {
     let default = match (arguments.quiet, arguments.verbose) {
         (true, _) => "error",
         (false, 0) => "warn",
         (false, 1) => "warn,sightline=info",
         (false, _) => "info,sightline=debug",
     };
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(default));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(|| progress::LogWriter).init();
+    let (format, service) = (arguments.command.log_format(), arguments.command.service());
+    Telemetry::start(LogOptions { format, filter: default, service }, || progress::LogWriter)
 }

@@ -22,4 +22,6 @@ pub use schedule::{
     FailureClass, Lease, LeaseId, Missing, Outcome, Progress, SchedulePolicy, Scheduler, TaskState,
     WorkerId, pause_ms,
 };
-pub use status::{BakeStatus, Done, Phase, QuarantinedTask, WorkerStatus};
+pub use status::{
+    BakeStatus, Done, LeaseStatus, Phase, QuarantinedTask, TaskAttempts, WorkerStatus,
+};

@@ -174,6 +174,16 @@ impl TaskKind {
         }
     }
 
+    /// The name, for logs and metrics.
+    #[must_use]
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Segments { .. } => "segments",
+            Self::Cells { .. } => "cells",
+            Self::Join { .. } => "join",
+        }
+    }
+
     /// Number of segments or cells. Each counts once a task, whatever the number of states: most of
     /// what is solved in a state is what was solved in the one before.
     #[must_use]

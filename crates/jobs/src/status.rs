@@ -28,6 +28,22 @@ pub enum Phase {
 }
 
 impl Phase {
+    /// Every phase.
+    pub const ALL: [Self; 5] =
+        [Self::Planning, Self::Solving, Self::Merging, Self::Published, Self::Failed];
+
+    /// The name, as in JSON.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Planning => "planning",
+            Self::Solving => "solving",
+            Self::Merging => "merging",
+            Self::Published => "published",
+            Self::Failed => "failed",
+        }
+    }
+
     /// True when nothing follows.
     #[must_use]
     pub const fn is_final(self) -> bool {
@@ -59,6 +75,49 @@ pub struct WorkerStatus {
     pub tasks_committed: u32,
 }
 
+/// A lease in force.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LeaseStatus {
+    /// The task.
+    pub task: TaskId,
+    /// Number of the lease.
+    pub lease: u64,
+    /// Registration number of who holds it.
+    pub worker: u32,
+    /// Name of who holds it.
+    pub worker_name: String,
+    /// Number of this attempt at the task, from 1.
+    pub attempt: u32,
+    /// Time since it was given out, ms.
+    pub age_ms: u64,
+    /// Mean computing time of the committed tasks of its kind, ms; 0 when none is known.
+    pub usual_ms: u64,
+}
+
+impl LeaseStatus {
+    /// Times the usual that an attempt takes before it counts as straggling.
+    pub const STRAGGLER_TIMES: u64 = 3;
+    /// Shortest age of a straggler, ms: reading and writing take time too.
+    pub const STRAGGLER_MS_MIN: u64 = 5_000;
+
+    /// True when the attempt runs much longer than others of its kind.
+    #[must_use]
+    pub const fn is_straggler(&self) -> bool {
+        self.usual_ms > 0
+            && self.age_ms >= Self::STRAGGLER_MS_MIN
+            && self.age_ms > self.usual_ms.saturating_mul(Self::STRAGGLER_TIMES)
+    }
+}
+
+/// A task that was attempted more than once.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TaskAttempts {
+    /// The task.
+    pub task: TaskId,
+    /// Leases given out for it.
+    pub attempts: u32,
+}
+
 /// A task that is not tried any more.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct QuarantinedTask {
@@ -87,9 +146,20 @@ pub struct BakeStatus {
     pub joins: Done,
     /// Tasks that were committed before this coordinator started.
     pub tasks_resumed: u32,
-    /// Workers at hand.
+    /// Workers at hand; at most [`Self::LISTED_MAX`] of them.
     pub workers: Vec<WorkerStatus>,
-    /// Tasks that are not tried any more.
+    /// Number of workers at hand.
+    pub workers_at_hand: u32,
+    /// Leases in force, the oldest first; at most [`Self::LISTED_MAX`] of them.
+    pub leases: Vec<LeaseStatus>,
+    /// Number of leases in force.
+    pub leases_in_force: u32,
+    /// Tasks with more than one attempt, the most attempted first; at most [`Self::LISTED_MAX`].
+    pub attempts: Vec<TaskAttempts>,
+    /// Number of tasks with more than one attempt.
+    pub tasks_attempted_again: u32,
+    /// Tasks that are not tried any more; at most [`Self::LISTED_MAX`] of them, all are counted in
+    /// `tasks`.
     pub quarantined: Vec<QuarantinedTask>,
     /// Number of tasks that wait for quarantined ones.
     pub tasks_blocked: u32,
@@ -110,6 +180,9 @@ pub struct BakeStatus {
 }
 
 impl BakeStatus {
+    /// Longest list in a status: it is sent at every change.
+    pub const LISTED_MAX: usize = 256;
+
     /// Cells of the dataset, each once.
     #[must_use]
     pub const fn dataset_cells(&self) -> u64 {

@@ -21,6 +21,7 @@ mod error;
 mod file_cache;
 pub mod keys;
 mod manifest;
+mod observe;
 pub mod parts;
 mod publish;
 mod reader;
@@ -39,6 +40,7 @@ pub use manifest::{
     BoxRecord, DataFile, FORMAT, FileKind, Manifest, Pointer, SceneFile, SceneSource, Totals,
     VERSION,
 };
+pub use observe::{Observer, Operation};
 pub use parts::{
     decode_cell_part, decode_object_part, decode_segment_part, decode_segment_part_where,
     encode_cell_part, encode_object_part, encode_segment_part,

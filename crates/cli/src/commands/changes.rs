@@ -71,6 +71,12 @@ pub async fn since_last_bake(
     Ok(changes.min_by_key(Vec::len).map_or(Before::Nothing, Before::Other))
 }
 
+/// True when the manifest is that of the bake with this plan.
+pub fn is_of(manifest: &Manifest, plan: &Plan) -> bool {
+    manifest.scene.hash == plan.scene.digest
+        && changed_keys(&manifest.config, &config_json(&plan.config)).is_empty()
+}
+
 fn config_json(config: &BakeConfig) -> Value {
     serde_json::to_value(config).unwrap_or_default()
 }

@@ -6,6 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared, share_scene};
 use sightline_store::{BakeStore, redacted};
+use sightline_telemetry::WatchFlags;
+use sightline_telemetry::metrics::{Listener, Registry};
 use sightline_worker::{Worker, WorkerOptions};
 
 use super::bake::{open_store, prepare_on, read_config, stop_signal, watch};
@@ -25,7 +27,12 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
         let found = super::scene::locate(scene, tables, &command.input.cache).await?;
         let share = command.share_scene;
         share_scene(&store, &plan.scene, &found.path, &plan.config, share).await?;
-        let options = CoordinatorOptions::new(command.listen, store, plan, Arc::new(publisher));
+        let mut options = CoordinatorOptions::new(command.listen, store, plan, Arc::new(publisher));
+        options.security = command.security.clone().into();
+        options.health = command.health;
+        let mut registry = Registry::default();
+        options.metrics.register(&mut registry);
+        let _listener = listen_for_metrics(&command.watch, registry).await?;
         let mut coordinator = Coordinator::start(options).await?;
         note(&format!("waiting for workers: sightline worker --coordinator {}", coordinator.url()));
         watch(&mut coordinator, None).await;
@@ -49,6 +56,16 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
     Ok(())
 }
 
+/// Answers Prometheus, if it was asked for.
+async fn listen_for_metrics(watch: &WatchFlags, registry: Registry) -> Result<Option<Listener>> {
+    let Some(address) = watch.metrics else { return Ok(None) };
+    let started = Listener::start(address, registry).await;
+    started.map(Some).map_err(|error| {
+        Failure::new(Kind::Usage, format!("cannot listen on {address} for metrics: {error}"))
+            .with_help("choose another address with --metrics")
+    })
+}
+
 pub fn run_worker(command: &WorkerCommand) -> Result<()> {
     let mut options = WorkerOptions::new(&command.coordinator);
     options.scene_path.clone_from(&command.scene);
@@ -56,6 +73,9 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
     options.store = command.out.as_deref().map(BakeStore::open).transpose()?;
     options.threads = command.threads.unwrap_or(0) as usize;
     options.name = format!("process {}", std::process::id());
+    options.security = command.security.clone();
+    let mut registry = Registry::default();
+    options.metrics.register(&mut registry);
     let stopped = Arc::new(AtomicBool::new(false));
     let stop = {
         let stopped = Arc::clone(&stopped);
@@ -64,7 +84,10 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
             stopped.store(true, Ordering::Relaxed);
         }
     };
-    let summary = super::runtime()?.block_on(Worker::run(options, stop))?;
+    let summary = super::runtime()?.block_on(async {
+        let _listener = listen_for_metrics(&command.watch, registry).await?;
+        Ok::<_, Failure>(Worker::run(options, stop).await?)
+    })?;
     let mut table = Table::default();
     table
         .row("tasks", thousands(summary.tasks))

@@ -10,6 +10,8 @@ mod export;
 mod generate;
 mod info;
 mod scene;
+mod status;
+mod stored;
 mod verify;
 
 use std::path::{Path, PathBuf};
@@ -28,6 +30,7 @@ pub fn run(task: Task) -> Result<()> {
         Task::Bake(command) => bake::run(&command),
         Task::Coordinator(command) => cluster::run_coordinator(&command),
         Task::Worker(command) => cluster::run_worker(&command),
+        Task::Status(command) => status::run(&command),
         Task::Verify(command) => verify::run(&command),
         Task::Export(command) => export::run(&command),
         Task::Info(command) => info::run(&command),

@@ -80,6 +80,18 @@ pub enum FailureClass {
     Never,
 }
 
+impl FailureClass {
+    /// The name, for metrics.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::RetryElsewhere => "retry_elsewhere",
+            Self::RetryLater => "retry_later",
+            Self::Never => "never",
+        }
+    }
+}
+
 /// Limits of leases and retries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SchedulePolicy {

@@ -33,6 +33,7 @@ use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions};
 
+use crate::observe::{Observed, Observer};
 use crate::{Result, StoreError};
 pub use large::ObjectVersion;
 pub use location::{is_url, key_beside, local_path, redacted};
@@ -122,6 +123,12 @@ impl BakeStore {
         let location = redacted(location);
         let secrets = Arc::default();
         Self { objects, prefix, location, secrets, access_help: "", is_remote: false }
+    }
+
+    /// The same store; `observer` is told of every operation.
+    #[must_use]
+    pub fn observed(self, observer: Observer) -> Self {
+        Self { objects: Arc::new(Observed::new(self.objects, observer)), ..self }
     }
 
     /// The location as it was given, without what is secret in it.
