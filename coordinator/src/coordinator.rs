@@ -227,6 +227,7 @@ async fn serve(
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
         .build_v1()?;
+    let scaler = crate::scaler::service(shared.status.subscribe());
     let service = CoordinatorServer::new(Service(shared))
         .max_decoding_message_size(MESSAGE_BYTES_MAX)
         .max_encoding_message_size(MESSAGE_BYTES_MAX);
@@ -235,6 +236,7 @@ async fn serve(
         .add_service(health_service)
         .add_service(reflection)
         .add_service(service)
+        .add_service(scaler)
         .serve_with_incoming_shutdown(TcpListenerStream::new(listener), async {
             // A dropped sender asks for the end too.
             let _ = stopped.await;

@@ -4,6 +4,7 @@
 //! - [`Coordinator`]: runs a plan to its end, over gRPC.
 //! - [`journal`]: what is in the store, who may write it, and what a crash leaves behind.
 //! - [`dataset`]: from committed parts to a published dataset.
+//! - [`health`]: the health service on a port of its own, for probes.
 //!
 //! The same library runs embedded in `sightline bake`, with a worker in the same process, and
 //! alone in `sightline-coordinator`. It holds no state that the store does not: a coordinator can
@@ -13,8 +14,10 @@ pub mod clock;
 mod coordinator;
 pub mod dataset;
 mod error;
+pub mod health;
 pub mod journal;
 pub mod prepare;
+mod scaler;
 mod service;
 mod state;
 

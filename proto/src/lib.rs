@@ -17,6 +17,12 @@ pub mod v1 {
         include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 }
 
+/// Generated from `keda/externalscaler.proto`: what KEDA asks to know how many workers to run.
+#[allow(missing_docs, clippy::pedantic)]
+pub mod keda {
+    tonic::include_proto!("externalscaler");
+}
+
 /// Largest message that either side of the protocol accepts, bytes. The largest are statuses:
 /// some 100 bytes a worker and a quarantined task.
 pub const MESSAGE_BYTES_MAX: usize = 4 << 20;

@@ -25,6 +25,10 @@ pub struct Arguments {
     /// No progress and no notes, only results and errors.
     #[arg(short, long, global = true)]
     pub quiet: bool,
+
+    /// How progress is written: for people, or as messages of Open Job Description on stdout.
+    #[arg(long, global = true, value_enum, default_value = "auto", value_name = "STYLE")]
+    pub progress: crate::progress::Style,
 }
 
 /// The commands.
@@ -48,6 +52,8 @@ pub enum Task {
     Cell(Cell),
     /// Generate a city, bake it, verify it, and show where to look next.
     Demo(Demo),
+    /// Manifests for Kubernetes.
+    K8s(crate::commands::K8s),
 }
 
 impl Task {
@@ -60,7 +66,7 @@ impl Task {
             Self::Export(c) => c.json,
             Self::Info(c) => c.json,
             Self::Cell(c) => c.json,
-            Self::Coordinator(_) | Self::Worker(_) | Self::Demo(_) => false,
+            Self::Coordinator(_) | Self::Worker(_) | Self::Demo(_) | Self::K8s(_) => false,
         }
     }
 }
@@ -153,6 +159,9 @@ pub struct Coordinator {
     /// Address and port to listen on.
     #[arg(long, default_value = "127.0.0.1:7070", value_name = "HOST:PORT")]
     pub listen: std::net::SocketAddr,
+    /// Answer gRPC health checks here, without encryption, for the probes of a platform.
+    #[arg(long, value_name = "HOST:PORT", env = "SIGHTLINE_HEALTH")]
+    pub health: Option<std::net::SocketAddr>,
 }
 
 /// `worker`.
@@ -170,6 +179,9 @@ pub struct Worker {
     /// Threads; all cores when absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
+    /// Answer gRPC health checks here, without encryption, for the probes of a platform.
+    #[arg(long, value_name = "HOST:PORT", env = "SIGHTLINE_HEALTH")]
+    pub health: Option<std::net::SocketAddr>,
 }
 
 /// A dataset and its scene.

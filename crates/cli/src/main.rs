@@ -23,6 +23,7 @@ fn main() -> ExitCode {
     if arguments.quiet {
         progress::be_quiet();
     }
+    progress::use_style(arguments.progress);
     let json = arguments.command.wants_json();
     match commands::run(arguments.command) {
         Ok(()) => ExitCode::SUCCESS,
@@ -32,6 +33,7 @@ fn main() -> ExitCode {
                 report::print_json(&failure.to_json());
             }
             let code = failure.kind.exit_code();
+            progress::failed(&failure.to_line());
             show(failure);
             ExitCode::from(code)
         }

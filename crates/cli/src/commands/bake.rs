@@ -73,14 +73,19 @@ pub fn bake(input: &BakeInput, threads: Option<u32>) -> Result<Baked> {
 pub fn read_config(input: &BakeInput) -> Result<BakeConfig> {
     let text = match &input.config {
         None => String::new(),
-        Some(path) => std::fs::read_to_string(path).map_err(|e| {
-            Failure::io(Kind::Usage, "read the configuration", path, &e)
-                .with_help("give a TOML file with --config, or flags alone")
-        })?,
+        Some(path) => read_config_file(path)?,
     };
     let overrides: Vec<(&str, &str)> =
         input.keys.overrides.iter().map(|(k, v)| (*k, v.as_str())).collect();
     Ok(BakeConfig::from_toml_with(&text, &overrides)?)
+}
+
+/// The text of a configuration file.
+pub fn read_config_file(path: &Path) -> Result<String> {
+    std::fs::read_to_string(path).map_err(|e| {
+        Failure::io(Kind::Usage, "read the configuration", path, &e)
+            .with_help("give a TOML file with --config, or flags alone")
+    })
 }
 
 /// Reads the scene and plans the bake, on so many threads.

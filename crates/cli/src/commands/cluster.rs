@@ -4,6 +4,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use sightline_coordinator::health::Health;
 use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared};
 use sightline_store::BakeStore;
 use sightline_worker::{Worker, WorkerOptions};
@@ -16,13 +17,18 @@ use crate::report::{Table, count, duration, print, thousands};
 
 pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
     let config = read_config(&command.input)?;
+    let runtime = super::runtime()?;
+    let health = runtime.block_on(serve_health(command.health))?;
     let Prepared { scene, plan, publisher } = prepare_on(&command.input, config, None)?;
-    let ended = super::runtime()?.block_on(async {
+    let ended = runtime.block_on(async {
         let store = open_store(&command.input, &scene.digest, &plan).await?;
         // The scene is the workers' matter from here on.
         drop(scene);
         let options = CoordinatorOptions::new(command.listen, store, plan, Arc::new(publisher));
         let mut coordinator = Coordinator::start(options).await?;
+        if let Some(health) = &health {
+            health.ready().await;
+        }
         note(&format!("waiting for workers: sightline worker --coordinator {}", coordinator.url()));
         watch(&mut coordinator, None).await;
         Ok::<_, Failure>(coordinator.join().await?)
@@ -42,6 +48,14 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
     Ok(())
 }
 
+/// Answers probes from now on, if that was asked for.
+async fn serve_health(listen: Option<std::net::SocketAddr>) -> Result<Option<Health>> {
+    match listen {
+        Some(listen) => Ok(Some(Health::serve(listen).await?)),
+        None => Ok(None),
+    }
+}
+
 pub fn run_worker(command: &WorkerCommand) -> Result<()> {
     let mut options = WorkerOptions::new(&command.coordinator);
     options.scene_path.clone_from(&command.scene);
@@ -56,7 +70,9 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
             stopped.store(true, Ordering::Relaxed);
         }
     };
-    let summary = super::runtime()?.block_on(Worker::run(options, stop))?;
+    let runtime = super::runtime()?;
+    let _health = runtime.block_on(serve_health(command.health))?;
+    let summary = runtime.block_on(Worker::run(options, stop))?;
     let mut table = Table::default();
     table
         .row("tasks", thousands(summary.tasks))
@@ -64,8 +80,9 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
         .row("solving", duration(summary.solve_time.as_secs_f64()));
     print(&table.to_string());
     if stopped.load(Ordering::Relaxed) {
-        note("stopped; the task at hand goes to another worker");
-        return Ok(());
+        // Not a success: a platform that starts workers must not take it for the end of the bake.
+        return Err(Failure::new(Kind::Interrupted, "stopped before the end of the bake")
+            .with_help("the task at hand goes to another worker"));
     }
     if summary.published {
         return Ok(());

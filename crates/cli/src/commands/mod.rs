@@ -9,7 +9,10 @@ mod demo;
 mod export;
 mod generate;
 mod info;
+mod k8s;
 mod verify;
+
+pub use k8s::K8s;
 
 use std::path::{Path, PathBuf};
 
@@ -32,6 +35,7 @@ pub fn run(task: Task) -> Result<()> {
         Task::Info(command) => info::run(&command),
         Task::Cell(command) => cell::run(&command),
         Task::Demo(command) => demo::run(&command),
+        Task::K8s(command) => k8s::run(&command),
     }
 }
 
