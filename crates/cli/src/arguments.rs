@@ -142,6 +142,9 @@ pub struct Bake {
     /// Threads; all cores when absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
+    /// Whether others may help.
+    #[command(flatten)]
+    pub joining: crate::commands::Joining,
     /// Print the plan and stop.
     #[arg(long)]
     pub dry_run: bool,
@@ -167,7 +170,7 @@ pub struct Coordinator {
 /// `worker`.
 #[derive(Debug, Args)]
 pub struct Worker {
-    /// The coordinator, such as http://127.0.0.1:7070.
+    /// The coordinator, such as http://127.0.0.1:7070, or @FILE: a bake's --announce.
     #[arg(long, value_name = "URL")]
     pub coordinator: String,
     /// The scene on this machine, when it is elsewhere than on the coordinator's.

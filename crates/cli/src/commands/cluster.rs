@@ -57,7 +57,11 @@ async fn serve_health(listen: Option<std::net::SocketAddr>) -> Result<Option<Hea
 }
 
 pub fn run_worker(command: &WorkerCommand) -> Result<()> {
-    let mut options = WorkerOptions::new(&command.coordinator);
+    let runtime = super::runtime()?;
+    let Some(coordinator) = runtime.block_on(super::joining::find(&command.coordinator))? else {
+        return Ok(());
+    };
+    let mut options = WorkerOptions::new(&coordinator);
     options.scene_path.clone_from(&command.scene);
     options.store = command.out.as_deref().map(BakeStore::open).transpose()?;
     options.threads = command.threads.unwrap_or(0) as usize;
@@ -70,9 +74,12 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
             stopped.store(true, Ordering::Relaxed);
         }
     };
-    let runtime = super::runtime()?;
     let _health = runtime.block_on(serve_health(command.health))?;
-    let summary = runtime.block_on(Worker::run(options, stop))?;
+    let summary = match runtime.block_on(Worker::run(options, stop)) {
+        // The bake ended between the look into the file and the first call.
+        Err(_) if super::joining::is_over(&command.coordinator) => return Ok(()),
+        ended => ended?,
+    };
     let mut table = Table::default();
     table
         .row("tasks", thousands(summary.tasks))

@@ -34,7 +34,7 @@ pub fn run(command: &Demo) -> Result<()> {
         config: None,
         keys: configuration(made.suggested_region, made.suggested_eye_height),
     };
-    let baked = bake(&input, command.threads)?;
+    let baked = bake(&input, command.threads, &super::Joining::default())?;
     print(&format!("{}\n", baked.to_text()));
 
     note("3 of 4: verifying");

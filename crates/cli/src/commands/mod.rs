@@ -9,9 +9,11 @@ mod demo;
 mod export;
 mod generate;
 mod info;
+mod joining;
 mod k8s;
 mod verify;
 
+pub use joining::Joining;
 pub use k8s::K8s;
 
 use std::path::{Path, PathBuf};
