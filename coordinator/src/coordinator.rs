@@ -74,9 +74,6 @@ pub struct CoordinatorOptions {
     pub name: String,
     /// Who may talk to the coordinator.
     pub security: SecurityOptions,
-    /// Where to answer health checks without encryption, beside the service itself: probes have no
-    /// certificates.
-    pub health: Option<SocketAddr>,
     /// What is counted.
     pub metrics: Arc<Metrics>,
 }
@@ -102,7 +99,6 @@ impl CoordinatorOptions {
             patience: Duration::from_secs(300),
             name: unique_name(),
             security: SecurityOptions::default(),
-            health: None,
             metrics: Arc::default(),
         }
     }
@@ -210,10 +206,6 @@ impl Coordinator {
         options.store = options.store.observed(observer);
         let gate = Gate::new(&options.security, options.listen, Arc::clone(&options.metrics))?;
         let gate = Arc::new(gate);
-        let probes = match options.health {
-            Some(address) => Some(listen(address).await?),
-            None => None,
-        };
         let mut outage = Outage::new(options.patience);
         let (shared, status) = loop {
             match open_bake(&options, addr).await {
@@ -224,12 +216,10 @@ impl Coordinator {
         let (stop, stopped) = oneshot::channel();
         let (stop_server, server_stopped) = oneshot::channel();
         let is_encrypted = gate.tls().is_some();
-        let probes = probes.map(|(listener, _)| HealthListener::start(listener, &gate));
         let server = tokio::spawn(serve(accepted, Arc::clone(&shared), gate, server_stopped));
         let audited = Arc::clone(&shared);
         let run = Run { shared, options, addr, epoch_checked_ms: 0 };
         let end = tokio::spawn(async move {
-            let _probes = probes;
             let end = run.drive(stopped).await;
             let _ = stop_server.send(());
             match server.await {
@@ -323,6 +313,7 @@ where
         .register_encoded_file_descriptor_set(v1::FILE_DESCRIPTOR_SET)
         .build_v1()?;
     let counts = CountLayer(shared.metrics.as_ref().clone());
+    let scaler = crate::scaler::service(shared.status.subscribe());
     let service = CoordinatorServer::new(Service(shared))
         .max_decoding_message_size(MESSAGE_BYTES_MAX)
         .max_encoding_message_size(MESSAGE_BYTES_MAX);
@@ -334,6 +325,7 @@ where
         .add_service(health_service)
         .add_service(reflection)
         .add_service(service)
+        .add_service(scaler)
         .serve_with_incoming_shutdown(incoming, async {
             // A dropped sender asks for the end too.
             let _ = stopped.await;
@@ -385,7 +377,7 @@ impl Outage {
 }
 
 /// A server that nobody can make hold more than a bounded amount, and that notices who is gone.
-fn limited() -> tonic::transport::Server {
+pub(crate) fn limited() -> tonic::transport::Server {
     tonic::transport::Server::builder()
         .max_concurrent_streams(STREAMS_MAX)
         .concurrency_limit_per_connection(STREAMS_MAX as usize)
@@ -407,29 +399,6 @@ fn stream_of(
         });
         Some((accepted, listener))
     })
-}
-
-/// Answers health checks and nothing else, in plain text; stops when it is dropped.
-struct HealthListener(JoinHandle<()>);
-
-impl HealthListener {
-    fn start(listener: TcpListener, gate: &Gate) -> Self {
-        let open = Arc::new(gate.without_credentials());
-        Self(tokio::spawn(async move {
-            let (health, service) = tonic_health::server::health_reporter();
-            health.set_serving::<CoordinatorServer<Service>>().await;
-            let incoming = connections(stream_of(listener), open);
-            if let Err(error) = limited().add_service(service).serve_with_incoming(incoming).await {
-                tracing::warn!(%error, "health is not answered any more");
-            }
-        }))
-    }
-}
-
-impl Drop for HealthListener {
-    fn drop(&mut self) {
-        self.0.abort();
-    }
 }
 
 /// The loop of a running coordinator.

@@ -6,6 +6,7 @@
 //! - [`scene_files`]: scenes from object stores, and copies for workers.
 //! - [`security`]: who may talk to it; [`metrics`]: what it counts.
 //! - [`dataset`]: from committed parts to a published dataset.
+//! - [`health`]: the health service on a port of its own, for probes.
 //!
 //! The same library runs embedded in `sightline bake`, with a worker in the same process, and
 //! alone in `sightline-coordinator`. It holds no state that the store does not: a coordinator can
@@ -16,9 +17,11 @@ pub mod clock;
 mod coordinator;
 pub mod dataset;
 mod error;
+pub mod health;
 pub mod journal;
 pub mod metrics;
 pub mod prepare;
+mod scaler;
 pub mod scene_files;
 pub mod security;
 mod service;

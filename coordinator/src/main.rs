@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Parser;
+use sightline_coordinator::health::Health;
 use sightline_coordinator::{
     Coordinator, CoordinatorOptions, Prepared, SecurityFlags, ShareScene, Summary, fetch_scene,
     prepare_from, share_scene,
@@ -102,6 +103,10 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
         .map(|text| text.split_once('=').ok_or(format!("--set {text}: write KEY=VALUE")))
         .collect::<Result<Vec<_>, _>>()?;
     let config = BakeConfig::from_toml_with(&text, &overrides)?;
+    let health = match arguments.health {
+        Some(address) => Some(Health::serve(address).await?),
+        None => None,
+    };
     let store = BakeStore::open_or_create(&arguments.out)?;
     let (scene, fetched) = match local_path(&arguments.scene) {
         Some(path) => (path, None),
@@ -125,7 +130,6 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
     let mut options = CoordinatorOptions::new(arguments.listen, store, plan, Arc::new(publisher));
     options.policy.lease_ms = arguments.lease_ms;
     options.security = arguments.security.into();
-    options.health = arguments.health;
     let mut registry = Registry::default();
     options.metrics.register(&mut registry);
     let _listener = match arguments.watch.metrics {
@@ -134,6 +138,9 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
     };
     options.worker_wait = arguments.worker_wait.map(Duration::from_secs);
     let mut coordinator = Coordinator::start(options).await?;
+    if let Some(health) = &health {
+        health.ready().await;
+    }
     let mut status = coordinator.status();
     let ended = async { status.wait_for(|s| s.phase.is_final()).await.map(drop) };
     tokio::select! {

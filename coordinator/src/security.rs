@@ -186,18 +186,6 @@ impl Gate {
         Ok(gate)
     }
 
-    /// The same limits for a listener that asks nobody who they are.
-    pub fn without_credentials(&self) -> Self {
-        Self {
-            tls: None,
-            asks_for_certificates: false,
-            tokens: None,
-            refusals: RefusalLog::default(),
-            limits: self.limits,
-            metrics: Arc::clone(&self.metrics),
-        }
-    }
-
     fn check_address(&self, address: SocketAddr, insecure: bool) -> Result<(), SecurityError> {
         let is_loopback = address.ip().to_canonical().is_loopback();
         let missing = match (self.tls.is_some(), self.authenticates()) {

@@ -18,6 +18,12 @@ pub mod v1 {
         include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 }
 
+/// Generated from `keda/externalscaler.proto`: what KEDA asks to know how many workers to run.
+#[allow(missing_docs, clippy::pedantic)]
+pub mod keda {
+    tonic::include_proto!("externalscaler");
+}
+
 /// Largest message that either side of the protocol accepts, bytes. The largest are statuses, whose
 /// lists are bounded: a quarantined task comes with a reason of several kB at most.
 pub const MESSAGE_BYTES_MAX: usize = 4 << 20;

@@ -1,6 +1,6 @@
 //! What the end-to-end, licence and architecture tests stand on: the workspace as cargo sees it,
-//! the built commands, processes that never outlive a test, datasets to compare, and requirements
-//! that are skipped loudly when this machine lacks them.
+//! the built commands, processes that never outlive a test, datasets to compare, Kubernetes Jobs run
+//! as processes, and requirements that are skipped loudly when this machine lacks them.
 
 pub mod binaries;
 pub mod campaign;
@@ -10,6 +10,9 @@ pub mod conformance;
 pub mod dataset;
 pub mod flaky_proxy;
 pub mod fuzzing;
+pub mod job;
+pub mod manifests;
+pub mod pods;
 pub mod process;
 pub mod requirement;
 pub mod scenes;

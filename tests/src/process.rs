@@ -88,8 +88,20 @@ impl Process {
     /// When the process has ended by itself.
     pub fn interrupt(&mut self) {
         assert!(self.is_running(), "{} ended before Ctrl-C:\n{}", self.name, self.stderr());
-        // `kill` of the shell, since the standard library sends only SIGKILL.
-        let kill = format!("kill -INT {}", self.child.id());
+        self.signal("INT");
+    }
+
+    /// Sends a signal by its name, such as `TERM`. Nothing happens when the process has ended.
+    ///
+    /// # Panics
+    /// When a running process does not take it.
+    pub fn signal(&mut self, name: &str) {
+        if !self.is_running() {
+            return;
+        }
+        // `kill` of the shell, since the standard library sends only SIGKILL. The process is not
+        // waited for yet, so its number belongs to nobody else.
+        let kill = format!("kill -{name} {}", self.child.id());
         let status = Command::new("sh").args(["-c", &kill]).status().expect("sh runs");
         assert!(status.success(), "{kill} failed");
     }

@@ -54,6 +54,30 @@ pub fn node_with(package: &std::path::Path) -> Option<PathBuf> {
     (package.is_dir() && succeeds(Command::new(&node).arg("--version"))).then_some(node)
 }
 
+/// The validator of Kubernetes objects, if `tests/run` has installed it.
+#[must_use]
+pub fn kubernetes_validate() -> Option<PathBuf> {
+    in_venv("kubernetes-validate")
+}
+
+/// The runner of Open Job Description, if `tests/run` has installed it.
+#[must_use]
+pub fn openjd() -> Option<PathBuf> {
+    in_venv("openjd")
+}
+
+fn in_venv(command: &str) -> Option<PathBuf> {
+    let path = workspace::root().join(".venv/bin").join(command);
+    succeeds(Command::new(&path).arg("--version")).then_some(path)
+}
+
+/// kubectl, if it is installed. It needs no cluster.
+#[must_use]
+pub fn kubectl() -> Option<PathBuf> {
+    let kubectl = PathBuf::from("kubectl");
+    succeeds(Command::new(&kubectl).args(["version", "--client"])).then_some(kubectl)
+}
+
 /// Node, if the Khronos validator has been installed beside its script.
 #[must_use]
 pub fn node_with_validator() -> Option<PathBuf> {

@@ -38,11 +38,14 @@ struct Arguments {
     #[arg(long, default_value_t = 0)]
     threads: usize,
     /// A name for people.
-    #[arg(long, default_value = "worker", env = "SIGHTLINE_WORKER_NAME")]
+    #[arg(long, default_value = "worker", env = "SIGHTLINE_NAME")]
     name: String,
     /// How long to look for a coordinator that does not answer, s.
     #[arg(long, default_value_t = 60, value_name = "SECONDS")]
     patience: u64,
+    /// How long the task at hand may still take when the worker is asked to stop, s.
+    #[arg(long, value_name = "SECONDS", default_value_t = 20, env = "SIGHTLINE_DRAIN_SECONDS")]
+    drain_seconds: u64,
     #[command(flatten)]
     security: ClientSecurity,
     #[command(flatten)]
@@ -94,6 +97,7 @@ async fn run(arguments: Arguments) -> Result<WorkerSummary, Error> {
     options.threads = arguments.threads;
     options.name = arguments.name;
     options.patience = Duration::from_secs(arguments.patience);
+    options.drain = Duration::from_secs(arguments.drain_seconds);
     options.security = arguments.security;
     let mut registry = Registry::default();
     options.metrics.register(&mut registry);

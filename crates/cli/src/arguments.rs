@@ -29,6 +29,10 @@ pub struct Arguments {
     /// No progress and no notes, only results and errors.
     #[arg(short, long, global = true)]
     pub quiet: bool,
+
+    /// How progress is written: for people, or as messages of Open Job Description on stdout.
+    #[arg(long, global = true, value_enum, default_value = "auto", value_name = "STYLE")]
+    pub progress: crate::progress::Style,
 }
 
 /// The commands.
@@ -54,6 +58,8 @@ pub enum Task {
     Cell(Cell),
     /// Generate a city, bake it, verify it, and show where to look next.
     Demo(Demo),
+    /// Manifests for Kubernetes.
+    K8s(crate::commands::K8s),
 }
 
 impl Task {
@@ -85,7 +91,7 @@ impl Task {
             Self::Info(c) => c.json,
             Self::Cell(c) => c.json,
             Self::Status(c) => c.json,
-            Self::Coordinator(_) | Self::Worker(_) | Self::Demo(_) => false,
+            Self::Coordinator(_) | Self::Worker(_) | Self::Demo(_) | Self::K8s(_) => false,
         }
     }
 }
@@ -183,6 +189,9 @@ pub struct Bake {
     /// Threads; all cores when absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
+    /// Whether others may help.
+    #[command(flatten)]
+    pub joining: crate::commands::Joining,
     /// Print the plan and stop.
     #[arg(long)]
     pub dry_run: bool,
@@ -219,7 +228,7 @@ pub struct Coordinator {
 /// `worker`.
 #[derive(Debug, Args)]
 pub struct Worker {
-    /// The coordinator, such as http://127.0.0.1:7070.
+    /// The coordinator, such as http://127.0.0.1:7070, or @FILE: a bake's --announce.
     #[arg(long, value_name = "URL")]
     pub coordinator: String,
     /// The scene on this machine or its URL, when it is elsewhere than on the coordinator's. Where it is
@@ -238,6 +247,16 @@ pub struct Worker {
     /// Threads; all cores when absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
+    /// Answer gRPC health checks here, without encryption, for the probes of a platform.
+    #[arg(long, value_name = "HOST:PORT", env = "SIGHTLINE_HEALTH")]
+    pub health: Option<std::net::SocketAddr>,
+    /// How long the task at hand may still take when the worker is asked to stop (Ctrl-C, SIGTERM), s.
+    /// Below the time that a platform gives a process to end.
+    #[arg(long, value_name = "SECONDS", default_value_t = 20, env = "SIGHTLINE_DRAIN_SECONDS")]
+    pub drain_seconds: u64,
+    /// A name for people, in statuses and logs; need not be unique. The process number when absent.
+    #[arg(long, value_name = "NAME", env = "SIGHTLINE_NAME")]
+    pub name: Option<String>,
     /// Credentials.
     #[command(flatten)]
     pub security: ClientSecurity,

@@ -140,6 +140,13 @@ impl Failure {
         Self::new(kind, format!("cannot {what} `{}`: {error}", path.display()))
     }
 
+    /// The failure and what to do about it, on one line.
+    pub fn to_line(&self) -> String {
+        let parts = [Some(&self.message), self.help.as_ref()];
+        let parts: Vec<&str> = parts.into_iter().flatten().map(String::as_str).collect();
+        parts.join("; ").split_whitespace().collect::<Vec<_>>().join(" ")
+    }
+
     /// The failure as a JSON value.
     pub fn to_json(&self) -> serde_json::Value {
         json!({ "error": {

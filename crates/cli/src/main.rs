@@ -24,6 +24,7 @@ fn main() -> ExitCode {
     if arguments.quiet {
         progress::be_quiet();
     }
+    progress::use_style(arguments.progress);
     let json = arguments.command.wants_json();
     let ended = match &telemetry {
         Ok(_) => commands::run(arguments.command),
@@ -37,6 +38,7 @@ fn main() -> ExitCode {
                 report::print_json(&failure.to_json());
             }
             let code = failure.kind.exit_code();
+            progress::failed(&failure.to_line());
             show(failure);
             ExitCode::from(code)
         }

@@ -17,6 +17,7 @@ use sightline_store::{BakeStore, Dataset};
 use sightline_worker::{Worker, WorkerOptions};
 use tokio::sync::oneshot;
 
+use super::Joining;
 use super::changes::{Before, since_last_bake};
 use super::dataset::Summary;
 use crate::arguments::{Bake, BakeInput};
@@ -32,7 +33,7 @@ pub fn run(command: &Bake) -> Result<()> {
     if command.dry_run {
         return dry_run(command);
     }
-    let baked = bake(&command.input, command.threads)?;
+    let baked = bake(&command.input, command.threads, &command.joining)?;
     if command.json {
         print_json(&baked.to_json());
     } else {
@@ -51,7 +52,7 @@ pub struct Baked {
 }
 
 /// Bakes on this machine, from reading the scene to the published dataset.
-pub fn bake(input: &BakeInput, threads: Option<u32>) -> Result<Baked> {
+pub fn bake(input: &BakeInput, threads: Option<u32>, joining: &Joining) -> Result<Baked> {
     let config = read_config(input)?;
     let mut phases = Phases::start("read and plan");
     let prepared = prepare_on(input, config, threads)?;
@@ -60,7 +61,7 @@ pub fn bake(input: &BakeInput, threads: Option<u32>) -> Result<Baked> {
     let (ended, summary) = runtime.block_on(async {
         let store = open_store(input, &prepared.scene.digest, &plan).await?;
         phases.next("solve");
-        let ended = solve(prepared, store.clone(), threads, &mut phases).await?;
+        let ended = solve(prepared, store.clone(), threads, joining, &mut phases).await?;
         phases.next("summarize");
         let summary = Summary::of(&Dataset::open(&store).await?).await?;
         Ok::<_, Failure>((ended, summary))
@@ -73,14 +74,19 @@ pub fn bake(input: &BakeInput, threads: Option<u32>) -> Result<Baked> {
 pub fn read_config(input: &BakeInput) -> Result<BakeConfig> {
     let text = match &input.config {
         None => String::new(),
-        Some(path) => std::fs::read_to_string(path).map_err(|e| {
-            Failure::io(Kind::Usage, "read the configuration", path, &e)
-                .with_help("give a TOML file with --config, or flags alone")
-        })?,
+        Some(path) => read_config_file(path)?,
     };
     let overrides: Vec<(&str, &str)> =
         input.keys.overrides.iter().map(|(k, v)| (*k, v.as_str())).collect();
     Ok(BakeConfig::from_toml_with(&text, &overrides)?)
+}
+
+/// The text of a configuration file.
+pub fn read_config_file(path: &Path) -> Result<String> {
+    std::fs::read_to_string(path).map_err(|e| {
+        Failure::io(Kind::Usage, "read the configuration", path, &e)
+            .with_help("give a TOML file with --config, or flags alone")
+    })
 }
 
 /// Reads the scene and plans the bake, on so many threads.
@@ -125,13 +131,17 @@ async fn solve(
     prepared: Prepared,
     store: BakeStore,
     threads: Option<u32>,
+    joining: &Joining,
     phases: &mut Phases,
 ) -> Result<Ended> {
     let Prepared { scene, plan, publisher } = prepared;
-    let loopback = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
-    let mut options = CoordinatorOptions::new(loopback, store.clone(), plan, Arc::new(publisher));
-    options.linger = LINGER;
+    let publisher = Arc::new(publisher);
+    let mut options = CoordinatorOptions::new(joining.address(), store.clone(), plan, publisher);
+    if joining.listen.is_none() {
+        options.linger = LINGER;
+    }
     let mut coordinator = Coordinator::start(options).await?;
+    joining.announce(coordinator.addr)?;
 
     let mut options = WorkerOptions::new(&coordinator.url());
     options.store = Some(store);
@@ -152,8 +162,15 @@ async fn solve(
     match early {
         Some(Err(error)) => Err(error.into()),
         // A worker that ended well has heard of the end.
-        Some(Ok(_)) => Ok(coordinator.join().await?),
+        Some(Ok(_)) => {
+            let ended = coordinator.join().await?;
+            joining.over()?;
+            Ok(ended)
+        }
         None => {
+            if coordinator.status().borrow().phase == Phase::Published {
+                joining.over()?;
+            }
             let end = async {
                 let end = coordinator.join().await;
                 drop(stop);

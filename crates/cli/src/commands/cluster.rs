@@ -3,7 +3,9 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
+use sightline_coordinator::health::Health;
 use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared, share_scene};
 use sightline_store::{BakeStore, redacted};
 use sightline_telemetry::WatchFlags;
@@ -18,8 +20,10 @@ use crate::report::{Table, count, duration, print, thousands};
 
 pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
     let config = read_config(&command.input)?;
+    let runtime = super::runtime()?;
+    let health = runtime.block_on(serve_health(command.health))?;
     let Prepared { scene, plan, publisher } = prepare_on(&command.input, config, None)?;
-    let ended = super::runtime()?.block_on(async {
+    let ended = runtime.block_on(async {
         let store = open_store(&command.input, &scene.digest, &plan).await?;
         // The scene is the workers' matter from here on.
         drop(scene);
@@ -29,11 +33,13 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
         share_scene(&store, &plan.scene, &found.path, &plan.config, share).await?;
         let mut options = CoordinatorOptions::new(command.listen, store, plan, Arc::new(publisher));
         options.security = command.security.clone().into();
-        options.health = command.health;
         let mut registry = Registry::default();
         options.metrics.register(&mut registry);
         let _listener = listen_for_metrics(&command.watch, registry).await?;
         let mut coordinator = Coordinator::start(options).await?;
+        if let Some(health) = &health {
+            health.ready().await;
+        }
         note(&format!("waiting for workers: sightline worker --coordinator {}", coordinator.url()));
         watch(&mut coordinator, None).await;
         Ok::<_, Failure>(coordinator.join().await?)
@@ -66,13 +72,27 @@ async fn listen_for_metrics(watch: &WatchFlags, registry: Registry) -> Result<Op
     })
 }
 
+/// Answers probes from now on, if that was asked for.
+async fn serve_health(listen: Option<std::net::SocketAddr>) -> Result<Option<Health>> {
+    match listen {
+        Some(listen) => Ok(Some(Health::serve(listen).await?)),
+        None => Ok(None),
+    }
+}
+
 pub fn run_worker(command: &WorkerCommand) -> Result<()> {
-    let mut options = WorkerOptions::new(&command.coordinator);
+    let runtime = super::runtime()?;
+    let Some(coordinator) = runtime.block_on(super::joining::find(&command.coordinator))? else {
+        return Ok(());
+    };
+    let mut options = WorkerOptions::new(&coordinator);
     options.scene_path.clone_from(&command.scene);
     options.scene_access = command.cache.access(command.fetch_scene);
     options.store = command.out.as_deref().map(BakeStore::open).transpose()?;
     options.threads = command.threads.unwrap_or(0) as usize;
-    options.name = format!("process {}", std::process::id());
+    options.name =
+        command.name.clone().unwrap_or_else(|| format!("process {}", std::process::id()));
+    options.drain = Duration::from_secs(command.drain_seconds);
     options.security = command.security.clone();
     let mut registry = Registry::default();
     options.metrics.register(&mut registry);
@@ -81,13 +101,20 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
         let stopped = Arc::clone(&stopped);
         async move {
             stop_signal().await;
+            note("stopping behind the task at hand; once more stops at once");
             stopped.store(true, Ordering::Relaxed);
         }
     };
-    let summary = super::runtime()?.block_on(async {
+    let _health = runtime.block_on(serve_health(command.health))?;
+    let ended = runtime.block_on(async {
         let _listener = listen_for_metrics(&command.watch, registry).await?;
-        Ok::<_, Failure>(Worker::run(options, stop).await?)
+        Ok::<_, Failure>(Worker::run(options, stop).await)
     })?;
+    let summary = match ended {
+        // The bake ended between the look into the file and the first call.
+        Err(_) if super::joining::is_over(&command.coordinator) => return Ok(()),
+        ended => ended?,
+    };
     let mut table = Table::default();
     table
         .row("tasks", thousands(summary.tasks))
@@ -95,8 +122,9 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
         .row("solving", duration(summary.solve_time.as_secs_f64()));
     print(&table.to_string());
     if stopped.load(Ordering::Relaxed) {
-        note("stopped; the task at hand goes to another worker");
-        return Ok(());
+        // Not a success: a platform that starts workers must not take it for the end of the bake.
+        return Err(Failure::new(Kind::Interrupted, "stopped before the end of the bake")
+            .with_help("what it did is kept; a task that was not done goes to another worker"));
     }
     if summary.published {
         return Ok(());

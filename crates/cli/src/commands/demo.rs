@@ -37,7 +37,7 @@ pub fn run(command: &Demo) -> Result<()> {
         keys: configuration(made.suggested_region, made.suggested_eye_height),
         cache: CacheFlags::default(),
     };
-    let baked = bake(&input, command.threads)?;
+    let baked = bake(&input, command.threads, &super::Joining::default())?;
     print(&format!("{}\n", baked.to_text()));
 
     note("3 of 4: verifying");

@@ -9,10 +9,15 @@ mod demo;
 mod export;
 mod generate;
 mod info;
+mod joining;
+mod k8s;
 mod scene;
 mod status;
 mod stored;
 mod verify;
+
+pub use joining::Joining;
+pub use k8s::K8s;
 
 use std::path::{Path, PathBuf};
 
@@ -36,6 +41,7 @@ pub fn run(task: Task) -> Result<()> {
         Task::Info(command) => info::run(&command),
         Task::Cell(command) => cell::run(&command),
         Task::Demo(command) => demo::run(&command),
+        Task::K8s(command) => k8s::run(&command),
     }
 }
 
