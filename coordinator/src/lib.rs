@@ -21,4 +21,4 @@ mod state;
 pub use coordinator::{Coordinator, CoordinatorHandle, CoordinatorOptions, Summary};
 pub use dataset::{DatasetPublisher, Publish};
 pub use error::CoordinatorError;
-pub use prepare::{PrepareError, Prepared, prepare};
+pub use prepare::{PrepareError, Prepared, prepare, prepare_within};

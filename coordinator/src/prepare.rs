@@ -7,7 +7,7 @@ use sightline_jobs::{
     BakeConfig, ConfigError, Heights, Plan, SceneFile, SceneRef, SkippedCells, TiledCell, plan,
 };
 use sightline_scene::region::{self, RegionError, RegionSpec, TiledRegion, tile};
-use sightline_scene::{OpenOptions, Scene, SceneError};
+use sightline_scene::{MemoryLimit, OpenOptions, Scene, SceneError};
 use sightline_store::{
     NumberedInstance, NumberedMesh, Numbering, SceneFile as StoredFile, SceneObject, SceneSource,
 };
@@ -58,8 +58,22 @@ fn describe(skipped: &SkippedCells) -> String {
 /// # Errors
 /// When the configuration, the scene or the region is refused.
 pub fn prepare(path: &Path, config: BakeConfig) -> Result<Prepared, PrepareError> {
+    prepare_within(path, config, None)
+}
+
+/// As [`prepare`], in a process that may take so much memory.
+///
+/// # Errors
+/// As [`prepare`]; when the scene does not fit.
+pub fn prepare_within(
+    path: &Path,
+    config: BakeConfig,
+    memory: Option<MemoryLimit>,
+) -> Result<Prepared, PrepareError> {
     config.validate()?;
-    let scene = Scene::open(path, &open_options(path, &config))?;
+    let mut options = open_options(path, &config);
+    options.memory = memory;
+    let scene = Scene::open(path, &options)?;
     prepare_scene(Arc::new(scene), path, config)
 }
 

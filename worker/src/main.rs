@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
+use sightline_scene::{ByteSize, MemoryLimit, default_folder};
 use sightline_store::BakeStore;
 use sightline_worker::{Worker, WorkerOptions, WorkerSummary};
 
@@ -21,6 +22,13 @@ struct Arguments {
     /// The store, where it is elsewhere than for the coordinator.
     #[arg(long, value_name = "LOCATION", env = "SIGHTLINE_STORE")]
     store: Option<String>,
+    /// Most memory that the process takes, such as 4GiB: the scene is then read from a file of chunks,
+    /// of which only what is not hidden is loaded.
+    #[arg(long, value_name = "SIZE", env = "SIGHTLINE_MEMORY")]
+    memory: Option<ByteSize>,
+    /// Folder of the chunk files; `sightline` in the user's cache folder when absent.
+    #[arg(long, value_name = "DIR", env = "SIGHTLINE_CHUNKS", requires = "memory")]
+    chunks: Option<PathBuf>,
     /// Threads to solve with; 0 stands for one a core.
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -48,6 +56,8 @@ async fn main() -> ExitCode {
                 solve_ms,
                 published = summary.published,
                 message = summary.message,
+                chunks_loaded = summary.held.map(|held| held.loaded),
+                chunks_given_back = summary.held.map(|held| held.given_back),
                 "done"
             );
             ExitCode::SUCCESS
@@ -63,6 +73,8 @@ async fn run(arguments: Arguments) -> Result<WorkerSummary, Error> {
     let mut options = WorkerOptions::new(&arguments.coordinator);
     options.scene_path = arguments.scene;
     options.store = arguments.store.as_deref().map(BakeStore::open).transpose()?;
+    let folder = arguments.chunks.unwrap_or_else(default_folder);
+    options.memory = arguments.memory.map(|size| MemoryLimit::new(size.0, folder));
     options.threads = arguments.threads;
     options.name = arguments.name;
     options.patience = Duration::from_secs(arguments.patience);

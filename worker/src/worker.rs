@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use sightline_jobs::{FailureClass, Plan, TaskId};
 use sightline_proto::{decode_plan, v1};
-use sightline_scene::{OpenOptions, Scene};
+use sightline_scene::{Held, MemoryLimit, OpenOptions, Scene};
 use sightline_store::{BakeStore, keys};
 use tonic::Request;
 
@@ -41,6 +41,8 @@ pub struct WorkerOptions {
     pub scene_path: Option<PathBuf>,
     /// The scene, when it is in memory already.
     pub scene: Option<Arc<Scene>>,
+    /// How much memory the process may take; without it, a scene that is read is in memory.
+    pub memory: Option<MemoryLimit>,
     /// Threads to solve with; 0 stands for one a core.
     pub threads: usize,
     /// A name for people; need not be unique.
@@ -58,6 +60,7 @@ impl WorkerOptions {
             store: None,
             scene_path: None,
             scene: None,
+            memory: None,
             threads: 0,
             name: "worker".into(),
             patience: Duration::from_secs(60),
@@ -78,6 +81,8 @@ pub struct WorkerSummary {
     pub published: bool,
     /// How the bake ended, for people.
     pub message: String,
+    /// What was held of the scene when the bake ended, where memory is limited.
+    pub held: Option<Held>,
 }
 
 /// A worker.
@@ -140,6 +145,7 @@ impl Life {
                 _ => self.open_alive(&session).await?,
             };
             if self.serve(&session, &opened).await? {
+                self.summary.held = opened.scene.memory.as_ref().map(|keeper| keeper.held());
                 return Ok(());
             }
             bake = Some(opened);
@@ -192,13 +198,14 @@ impl Life {
     async fn read_scene(&self, path: &Path, plan: &Plan) -> Result<Arc<Scene>, WorkerError> {
         // As the coordinator did.
         let asked = &plan.config.scene;
-        let options = OpenOptions::of_bake(
+        let mut options = OpenOptions::of_bake(
             path,
             &asked.see_through,
             &asked.particles,
             asked.animation.as_deref(),
             asked.motion_error,
         );
+        options.memory = self.options.memory.clone();
         let path = path.to_owned();
         let read = self.pool.run(move || Scene::open(&path, &options)).await;
         let scene = read.map_err(|panic| WorkerError::Defect(panic.to_string()))??;

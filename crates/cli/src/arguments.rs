@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use clap::{ArgAction, ArgMatches, Args, Command, FromArgMatches, Parser, Subcommand, ValueEnum};
 use sightline_geometry::CellId;
 use sightline_jobs::{KEYS, KeyDoc};
+use sightline_scene::{ByteSize, MemoryLimit, default_folder};
 
 /// Precomputed visibility for large 3D worlds: which triangles can be seen from where.
 #[derive(Debug, Parser)]
@@ -107,6 +108,27 @@ pub struct Generate {
     pub json: bool,
 }
 
+/// How much memory the process may take.
+#[derive(Clone, Debug, Default, Args)]
+pub struct MemoryFlags {
+    /// Most memory that the process takes, such as 4GiB or 800MiB: triangles are then read from a file of
+    /// chunks, made beside others in --chunks the first time, and only what is not hidden is loaded.
+    /// The result is the same. Everything is in memory when absent.
+    #[arg(long, value_name = "SIZE", env = "SIGHTLINE_MEMORY")]
+    pub memory: Option<ByteSize>,
+    /// Folder of the chunk files; `sightline` in the user's cache folder when absent.
+    #[arg(long, value_name = "DIR", env = "SIGHTLINE_CHUNKS", requires = "memory")]
+    pub chunks: Option<PathBuf>,
+}
+
+impl MemoryFlags {
+    /// The limit that they ask for.
+    pub fn limit(&self) -> Option<MemoryLimit> {
+        let folder = || self.chunks.clone().unwrap_or_else(default_folder);
+        self.memory.map(|size| MemoryLimit::new(size.0, folder()))
+    }
+}
+
 /// Scene, output and configuration of a bake.
 #[derive(Debug, Args)]
 pub struct BakeInput {
@@ -118,6 +140,9 @@ pub struct BakeInput {
     /// Configuration file (TOML). Flags below overrule its keys.
     #[arg(short, long, value_name = "bake.toml")]
     pub config: Option<PathBuf>,
+    /// How much memory it may take.
+    #[command(flatten)]
+    pub memory: MemoryFlags,
     /// One flag a key of the configuration.
     #[command(flatten)]
     pub keys: ConfigFlags,
@@ -167,6 +192,9 @@ pub struct Worker {
     /// The dataset folder on this machine, when it is elsewhere than on the coordinator's.
     #[arg(long, value_name = "DIR")]
     pub out: Option<String>,
+    /// How much memory it may take.
+    #[command(flatten)]
+    pub memory: MemoryFlags,
     /// Threads; all cores when absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
@@ -181,6 +209,9 @@ pub struct DatasetInput {
     /// absent.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<PathBuf>,
+    /// How much memory it may take.
+    #[command(flatten)]
+    pub memory: MemoryFlags,
 }
 
 /// `verify`.

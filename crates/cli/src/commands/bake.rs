@@ -9,10 +9,10 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use sightline_coordinator::{
-    Coordinator, CoordinatorHandle, CoordinatorOptions, Prepared, Summary as Ended, prepare,
+    Coordinator, CoordinatorHandle, CoordinatorOptions, Prepared, Summary as Ended, prepare_within,
 };
 use sightline_jobs::{BakeConfig, BakeStatus, Done, Phase, Plan};
-use sightline_scene::SceneDigest;
+use sightline_scene::{Keeper, SceneDigest};
 use sightline_store::{BakeStore, Dataset};
 use sightline_worker::{Worker, WorkerOptions};
 use tokio::sync::oneshot;
@@ -21,7 +21,7 @@ use super::changes::{Before, since_last_bake};
 use super::dataset::Summary;
 use crate::arguments::{Bake, BakeInput};
 use crate::failure::{Failure, Kind, Result};
-use crate::memory::Phases;
+use crate::memory::{Phases, add_held, held_json};
 use crate::progress::{Progress, note};
 use crate::report::{Table, count, print, print_json, thousands};
 
@@ -48,6 +48,7 @@ pub struct Baked {
     ended: Ended,
     summary: Summary,
     phases: Phases,
+    memory: Option<Arc<Keeper>>,
 }
 
 /// Bakes on this machine, from reading the scene to the published dataset.
@@ -56,6 +57,7 @@ pub fn bake(input: &BakeInput, threads: Option<u32>) -> Result<Baked> {
     let mut phases = Phases::start("read and plan");
     let prepared = prepare_on(input, config, threads)?;
     let plan = prepared.plan.clone();
+    let memory = prepared.scene.memory.clone();
     let runtime = super::runtime()?;
     let (ended, summary) = runtime.block_on(async {
         let store = open_store(input, &prepared.scene.digest, &plan).await?;
@@ -66,7 +68,7 @@ pub fn bake(input: &BakeInput, threads: Option<u32>) -> Result<Baked> {
         Ok::<_, Failure>((ended, summary))
     })?;
     phases.finish();
-    Ok(Baked { out: input.out.clone(), plan, ended, summary, phases })
+    Ok(Baked { out: input.out.clone(), plan, ended, summary, phases, memory })
 }
 
 /// The configuration: the file, overruled by flags.
@@ -87,7 +89,8 @@ pub fn read_config(input: &BakeInput) -> Result<BakeConfig> {
 pub fn prepare_on(input: &BakeInput, config: BakeConfig, threads: Option<u32>) -> Result<Prepared> {
     // Commands that look for the scene later run in other folders.
     let scene = absolute(&input.scene);
-    Ok(super::on_threads(threads, || prepare(&scene, config))??)
+    let memory = input.memory.limit();
+    Ok(super::on_threads(threads, || prepare_within(&scene, config, memory))??)
 }
 
 fn absolute(path: &Path) -> PathBuf {
@@ -263,6 +266,7 @@ impl Baked {
             "worker_solve_ms": status.worker_solve_ms,
             "summary": self.summary.to_json(),
             "time": self.phases.to_json(),
+            "memory": held_json(self.memory.as_deref()),
         })
     }
 
@@ -281,6 +285,9 @@ impl Baked {
         }
         table.gap();
         self.phases.add_to(&mut table);
+        if let Some(keeper) = &self.memory {
+            add_held(&mut table, &keeper.held());
+        }
         table.to_string()
     }
 }

@@ -11,6 +11,7 @@ use sightline_worker::{Worker, WorkerOptions};
 use super::bake::{open_store, prepare_on, read_config, stop_signal, watch};
 use crate::arguments::{Coordinator as CoordinatorCommand, Worker as WorkerCommand};
 use crate::failure::{Failure, Kind, Result};
+use crate::memory::add_held;
 use crate::progress::note;
 use crate::report::{Table, count, duration, print, thousands};
 
@@ -46,6 +47,7 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
     let mut options = WorkerOptions::new(&command.coordinator);
     options.scene_path.clone_from(&command.scene);
     options.store = command.out.as_deref().map(BakeStore::open).transpose()?;
+    options.memory = command.memory.limit();
     options.threads = command.threads.unwrap_or(0) as usize;
     options.name = format!("process {}", std::process::id());
     let stopped = Arc::new(AtomicBool::new(false));
@@ -62,6 +64,9 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
         .row("tasks", thousands(summary.tasks))
         .row("failed attempts", thousands(summary.failures))
         .row("solving", duration(summary.solve_time.as_secs_f64()));
+    if let Some(held) = &summary.held {
+        add_held(&mut table, held);
+    }
     print(&table.to_string());
     if stopped.load(Ordering::Relaxed) {
         note("stopped; the task at hand goes to another worker");

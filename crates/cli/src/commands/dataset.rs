@@ -26,7 +26,9 @@ pub async fn open(location: &str) -> Result<Dataset> {
 pub async fn open_with_scene(input: &DatasetInput) -> Result<(Dataset, Scene, PathBuf)> {
     let dataset = open(&input.dataset).await?;
     let path = find_scene(&dataset, input).await?;
-    let scene = Scene::open(&path, &open_options(dataset.manifest(), &path))?;
+    let mut options = open_options(dataset.manifest(), &path);
+    options.memory = input.memory.limit();
+    let scene = Scene::open(&path, &options)?;
     expect_digest(dataset.manifest(), &scene.digest, &path)?;
     Ok((dataset, scene, path))
 }

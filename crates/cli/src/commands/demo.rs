@@ -7,7 +7,9 @@ use sightline_scene::generate::Kind as Generated;
 use super::bake::bake;
 use super::dataset::open_with_scene;
 use super::{export, generate, verify};
-use crate::arguments::{BakeInput, CellChoice, ConfigFlags, DatasetInput, Demo, Verify};
+use crate::arguments::{
+    BakeInput, CellChoice, ConfigFlags, DatasetInput, Demo, MemoryFlags, Verify,
+};
 use crate::failure::{Failure, Kind, Result};
 use crate::progress::note;
 use crate::report::{bytes, print, thousands};
@@ -32,13 +34,18 @@ pub fn run(command: &Demo) -> Result<()> {
         scene: scene.clone(),
         out: out.clone(),
         config: None,
+        memory: MemoryFlags::default(),
         keys: configuration(made.suggested_region, made.suggested_eye_height),
     };
     let baked = bake(&input, command.threads)?;
     print(&format!("{}\n", baked.to_text()));
 
     note("3 of 4: verifying");
-    let dataset = DatasetInput { dataset: out.clone(), scene: Some(scene.clone()) };
+    let dataset = DatasetInput {
+        dataset: out.clone(),
+        scene: Some(scene.clone()),
+        memory: MemoryFlags::default(),
+    };
     let check = verification(dataset, command.threads);
     let runtime = super::runtime()?;
     let (opened, geometry, _) = runtime.block_on(open_with_scene(&check.input))?;
