@@ -123,7 +123,7 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
     };
     let path = scene.clone();
     let Prepared { plan, publisher, scene: _ } =
-        tokio::task::spawn_blocking(move || prepare_from(&path, &uri, config)).await??;
+        tokio::task::spawn_blocking(move || prepare_from(&path, &uri, config, None)).await??;
     share_scene(&store, &plan.scene, &scene, &plan.config, arguments.share_scene).await?;
     drop(fetched);
 

@@ -7,7 +7,7 @@ use sightline_jobs::{
     BakeConfig, ConfigError, Heights, Plan, SceneFile, SceneRef, SkippedCells, TiledCell, plan,
 };
 use sightline_scene::region::{self, RegionError, RegionSpec, TiledRegion, tile};
-use sightline_scene::{OpenOptions, Scene, SceneError};
+use sightline_scene::{MemoryLimit, OpenOptions, Scene, SceneError};
 use sightline_store::{
     NumberedInstance, NumberedMesh, Numbering, SceneFile as StoredFile, SceneObject, SceneSource,
 };
@@ -58,16 +58,24 @@ fn describe(skipped: &SkippedCells) -> String {
 /// # Errors
 /// When the configuration, the scene or the region is refused.
 pub fn prepare(path: &Path, config: BakeConfig) -> Result<Prepared, PrepareError> {
-    prepare_from(path, &path.display().to_string(), config)
+    prepare_from(path, &path.display().to_string(), config, None)
 }
 
-/// As [`prepare`], of a scene that workers find at `uri`; `path` is where it lies here.
+/// As [`prepare`], of a scene that workers find at `uri`, in a process that may take so much memory; `path`
+/// is where the scene lies here.
 ///
 /// # Errors
-/// As [`prepare`].
-pub fn prepare_from(path: &Path, uri: &str, config: BakeConfig) -> Result<Prepared, PrepareError> {
+/// As [`prepare`]; when the scene does not fit.
+pub fn prepare_from(
+    path: &Path,
+    uri: &str,
+    config: BakeConfig,
+    memory: Option<MemoryLimit>,
+) -> Result<Prepared, PrepareError> {
     config.validate()?;
-    let scene = Scene::open(path, &open_options(path, &config))?;
+    let mut options = open_options(path, &config);
+    options.memory = memory;
+    let scene = Scene::open(path, &options)?;
     let mut prepared = prepare_scene(Arc::new(scene), path, config)?;
     // Where the scene lies is no part of the bake's identity.
     prepared.plan.scene.uri = sightline_store::redacted(uri);

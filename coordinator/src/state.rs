@@ -292,7 +292,7 @@ impl State {
             workers: self.worker_statuses(),
             workers_at_hand: u32::try_from(self.registered.len()).unwrap_or(u32::MAX),
             leases: self.lease_statuses(now_ms),
-            leases_in_force: self.scheduler.progress().leased,
+            leases_in_force: u32::try_from(self.scheduler.leases().count()).unwrap_or(u32::MAX),
             attempts: self.task_attempts(),
             tasks_attempted_again: u32::try_from(self.attempted_again.len()).unwrap_or(u32::MAX),
             quarantined: missing

@@ -29,6 +29,9 @@ const MEAN_MAX: f64 = 0.0002;
 /// Error of the worst viewpoint that a dataset may have, share of pixels: 0.5 %.
 const WORST_MAX: f64 = 0.005;
 
+/// A memory limit below what the command itself takes, and above what of the city stays in memory.
+const LITTLE: &str = "--memory=32MiB";
+
 fn folder() -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join("end_to_end")
 }
@@ -99,8 +102,12 @@ impl Cluster {
     }
 
     fn worker(&self, name: &str) -> Process {
+        self.worker_with(name, &[])
+    }
+
+    fn worker_with(&self, name: &str, flags: &[&str]) -> Process {
         let mut command = sightline(["worker", "--threads=1", "--coordinator", &self.url]);
-        Process::start(&mut command, &self.folder, name)
+        Process::start(command.args(flags), &self.folder, name)
     }
 }
 
@@ -141,12 +148,55 @@ fn a_worker_that_joins_late_helps_and_one_that_leaves_is_not_missed() {
     let cluster = Cluster::of_sightline("joining");
     let mut first = cluster.worker("first");
     assert!(eventually(LIMIT, || dataset::commits(&cluster.dataset) >= 2), "{}", first.stderr());
-    let late = cluster.worker("late");
+    // In so little memory that all of the scene is given back again and again.
+    let chunks = format!("--chunks={}", cluster.folder.join("chunks").display());
+    let late = cluster.worker_with("late", &[LITTLE, &chunks]);
     first.interrupt();
     let _ = first.wait(LIMIT);
     let _ = cluster.coordinator.wait(LIMIT).success();
-    let _ = late.wait(LIMIT).success();
+    let late = late.wait(LIMIT).success();
+    assert!(late.stdout.contains("given back"), "{}", late.stdout);
     dataset::assert_same(&baked().dataset, &cluster.dataset);
+}
+
+#[test]
+fn a_bake_in_little_memory_writes_the_same_bytes_and_is_measured_alike() {
+    let out = empty("limited");
+    let chunks = format!("--chunks={}", out.join("chunks").display());
+    let dataset = out.join("dataset");
+    let limited = |command: &mut Command| {
+        let ended = run(command.args([LITTLE, &chunks, "--json"])).success().json();
+        let given_back = number(&ended["memory"]["chunks_given_back"]);
+        assert!(given_back > 2.0 * number(&ended["memory"]["chunks"]), "{:#}", ended["memory"]);
+        ended
+    };
+    let scene = &baked().scene;
+    let _ = limited(&mut sightline(city::bake_arguments("bake", scene, &dataset, TASK_UNITS)));
+    dataset::assert_same(&baked().dataset, &dataset);
+    let verify = || {
+        let mut command = sightline(["verify", "--cells=2", "--viewpoints=3", "--rays=5000"]);
+        command.arg(&dataset).arg("--scene").arg(scene);
+        command
+    };
+    let found = limited(&mut verify());
+    let expected = run(verify().arg("--json")).success().json();
+    for key in ["rays", "error_mean", "error_max", "histogram"] {
+        assert_eq!(found[key], expected[key], "{key}");
+    }
+    assert!(expected["memory"].is_null(), "without a limit there is nothing to tell");
+}
+
+#[test]
+fn a_limit_that_a_scene_does_not_fit_is_refused_with_a_reason() {
+    let out = empty("too_little");
+    let chunks = format!("--chunks={}", out.join("chunks").display());
+    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out, TASK_UNITS));
+    let ended = run(command.args(["--memory=1MiB", &chunks]));
+    assert!(!ended.status.success());
+    assert!(ended.stderr.contains("the memory limit is 1 MiB"), "{}", ended.stderr);
+    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out, TASK_UNITS));
+    let ended = run(command.args(["--memory=much", &chunks]));
+    assert!(ended.stderr.contains("`much` is no size"), "{}", ended.stderr);
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
+use sightline_scene::{MemoryLimit, default_folder};
 use sightline_store::{BakeStore, ByteSize};
 use sightline_telemetry::metrics::{Listener, Registry};
 use sightline_telemetry::stop::signalled;
@@ -34,6 +35,13 @@ struct Arguments {
     /// The store, where it is elsewhere than for the coordinator.
     #[arg(long, value_name = "LOCATION", env = "SIGHTLINE_STORE")]
     store: Option<String>,
+    /// Most memory that the process takes, such as 4GiB: the scene is then read from a file of chunks,
+    /// of which only what is not hidden is loaded.
+    #[arg(long, value_name = "SIZE", env = "SIGHTLINE_MEMORY")]
+    memory: Option<ByteSize>,
+    /// Folder of the chunk files; `sightline` in the user's cache folder when absent.
+    #[arg(long, value_name = "DIR", env = "SIGHTLINE_CHUNKS", requires = "memory")]
+    chunks: Option<PathBuf>,
     /// Threads to solve with; 0 stands for one a core.
     #[arg(long, default_value_t = 0)]
     threads: usize,
@@ -74,6 +82,8 @@ fn main() -> ExitCode {
                 solve_ms,
                 published = summary.published,
                 end = summary.message,
+                chunks_loaded = summary.held.map(|held| held.loaded),
+                chunks_given_back = summary.held.map(|held| held.given_back),
                 "done"
             );
             ExitCode::SUCCESS
@@ -94,6 +104,8 @@ async fn run(arguments: Arguments) -> Result<WorkerSummary, Error> {
         cache_bytes_max: arguments.cache_size.0,
     };
     options.store = arguments.store.as_deref().map(BakeStore::open).transpose()?;
+    let folder = arguments.chunks.unwrap_or_else(default_folder);
+    options.memory = arguments.memory.map(|size| MemoryLimit::new(size.0, folder));
     options.threads = arguments.threads;
     options.name = arguments.name;
     options.patience = Duration::from_secs(arguments.patience);

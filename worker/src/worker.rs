@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use sightline_jobs::{FailureClass, Plan, TaskId};
 use sightline_proto::{decode_plan, v1};
-use sightline_scene::{OpenOptions, Scene};
+use sightline_scene::{Held, MemoryLimit, OpenOptions, Scene};
 use sightline_store::{BakeStore, ErrorClass, keys};
 use sightline_telemetry::trace;
 use tokio::sync::watch;
@@ -50,6 +50,8 @@ pub struct WorkerOptions {
     pub scene_access: SceneAccess,
     /// The scene, when it is in memory already.
     pub scene: Option<Arc<Scene>>,
+    /// How much memory the process may take; without it, a scene that is read is in memory.
+    pub memory: Option<MemoryLimit>,
     /// Threads to solve with; 0 stands for one a core.
     pub threads: usize,
     /// A name for people; need not be unique.
@@ -78,6 +80,7 @@ impl WorkerOptions {
             scene_path: None,
             scene_access: SceneAccess::default(),
             scene: None,
+            memory: None,
             threads: 0,
             name: "worker".into(),
             patience: Duration::from_secs(60),
@@ -103,6 +106,8 @@ pub struct WorkerSummary {
     pub published: bool,
     /// How the bake ended, for people.
     pub message: String,
+    /// What was held of the scene when the bake ended, where memory is limited.
+    pub held: Option<Held>,
 }
 
 /// A worker.
@@ -187,6 +192,7 @@ impl Life {
                 () = asked_to_stop(&mut stopped) => return Ok(()),
             };
             if self.serve(&opened).await? {
+                self.summary.held = opened.scene.memory.as_ref().map(|keeper| keeper.held());
                 return Ok(());
             }
             bake = Some(opened);
@@ -291,13 +297,14 @@ impl Life {
         let access = &self.options.scene_access;
         let found = scene_files::locate(&place, files, &asked.particles, store, access).await?;
         let path = &found.path;
-        let options = OpenOptions::of_bake(
+        let mut options = OpenOptions::of_bake(
             path,
             &asked.see_through,
             &asked.particles,
             asked.animation.as_deref(),
             asked.motion_error,
         );
+        options.memory = self.options.memory.clone();
         let (options, path) = (found.with_tables(options), path.to_owned());
         let read = self.pool.run(move || Scene::open(&path, &options)).await;
         let scene = read.map_err(|panic| WorkerError::Defect(panic.to_string()))??;

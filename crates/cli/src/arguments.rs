@@ -9,6 +9,7 @@ use clap::{ArgAction, ArgMatches, Args, Command, FromArgMatches, Parser, Subcomm
 use sightline_coordinator::{SecurityFlags, ShareScene};
 use sightline_geometry::CellId;
 use sightline_jobs::{KEYS, KeyDoc};
+use sightline_scene::{MemoryLimit, default_folder};
 use sightline_store::{ByteSize, CACHE_BYTES_MAX};
 use sightline_telemetry::{LogFormat, WatchFlags};
 use sightline_worker::ClientSecurity;
@@ -156,6 +157,27 @@ impl Default for CacheFlags {
     }
 }
 
+/// How much memory the process may take.
+#[derive(Clone, Debug, Default, Args)]
+pub struct MemoryFlags {
+    /// Most memory that the process takes, such as 4GiB or 800MiB: triangles are then read from a file of
+    /// chunks, made beside others in --chunks the first time, and only what is not hidden is loaded.
+    /// The result is the same. Everything is in memory when absent.
+    #[arg(long, value_name = "SIZE", env = "SIGHTLINE_MEMORY")]
+    pub memory: Option<ByteSize>,
+    /// Folder of the chunk files; `sightline` in the user's cache folder when absent.
+    #[arg(long, value_name = "DIR", env = "SIGHTLINE_CHUNKS", requires = "memory")]
+    pub chunks: Option<PathBuf>,
+}
+
+impl MemoryFlags {
+    /// The limit that they ask for.
+    pub fn limit(&self) -> Option<MemoryLimit> {
+        let folder = || self.chunks.clone().unwrap_or_else(default_folder);
+        self.memory.map(|size| MemoryLimit::new(size.0, folder()))
+    }
+}
+
 /// Scene, output and configuration of a bake.
 #[derive(Debug, Args)]
 pub struct BakeInput {
@@ -171,6 +193,9 @@ pub struct BakeInput {
     /// Copies of the scene, when it comes from an object store.
     #[command(flatten)]
     pub cache: CacheFlags,
+    /// How much memory it may take.
+    #[command(flatten)]
+    pub memory: MemoryFlags,
     /// One flag a key of the configuration.
     #[command(flatten)]
     pub keys: ConfigFlags,
@@ -244,6 +269,9 @@ pub struct Worker {
     /// Copies of a scene that is fetched.
     #[command(flatten)]
     pub cache: CacheFlags,
+    /// How much memory it may take.
+    #[command(flatten)]
+    pub memory: MemoryFlags,
     /// Threads; all cores when absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
@@ -298,6 +326,9 @@ pub struct DatasetInput {
     /// Copies of the scene, when it comes from an object store.
     #[command(flatten)]
     pub cache: CacheFlags,
+    /// How much memory it may take.
+    #[command(flatten)]
+    pub memory: MemoryFlags,
 }
 
 /// `verify`.

@@ -8,7 +8,9 @@ use std::time::Instant;
 
 use serde_json::{Value, json};
 
-use crate::report::{Table, bytes, duration};
+use sightline_scene::{Held, Keeper};
+
+use crate::report::{Table, bytes, duration, thousands};
 
 /// One finished phase.
 struct Phase {
@@ -74,6 +76,42 @@ impl Phases {
             .collect();
         json!({ "phases": phases, "peaks_are_cumulative": !self.separate })
     }
+}
+
+/// Adds rows on what was held of a scene in chunks.
+pub fn add_held(table: &mut Table, held: &Held) {
+    let Held { limit, bytes: size, chunks, touched, loaded, given_back, overruns } = *held;
+    table.row("memory limit", bytes(limit)).row(
+        "chunks",
+        format!(
+            "{} ({}), {} never touched, {} loaded, {} given back",
+            thousands(chunks),
+            bytes(size),
+            thousands(chunks - touched),
+            thousands(loaded),
+            thousands(given_back),
+        ),
+    );
+    if overruns > 0 {
+        table.row(
+            "above the limit",
+            format!("{} times, with nothing to give back", thousands(overruns)),
+        );
+    }
+}
+
+/// The same as JSON; null without a limit.
+pub fn held_json(keeper: Option<&Keeper>) -> Value {
+    let Some(held) = keeper.map(Keeper::held) else { return Value::Null };
+    json!({
+        "limit_bytes": held.limit,
+        "chunk_file_bytes": held.bytes,
+        "chunks": held.chunks,
+        "chunks_touched": held.touched,
+        "chunks_loaded": held.loaded,
+        "chunks_given_back": held.given_back,
+        "overruns": held.overruns,
+    })
 }
 
 /// Peak resident memory of this process, bytes.

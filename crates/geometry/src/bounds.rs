@@ -1,5 +1,6 @@
 //! Axis-aligned boxes: exact ones in `f64` (world), rounded outward in `f32` (hierarchy nodes).
 
+use bytemuck::{Pod, Zeroable};
 use glam::{DAffine3, DVec3};
 
 /// A closed axis-aligned box in `f64`, metres. Empty when any `min > max`.
@@ -68,7 +69,8 @@ impl Bounds {
 }
 
 /// A closed axis-aligned box in `f32`, as hierarchy nodes store it.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
 pub struct Bounds32 {
     /// Lower corner.
     pub min: [f32; 3],

@@ -14,11 +14,16 @@
 //! - leaves cover the items `0..n` once each, in order of [`Hierarchy::build`]'s permutation;
 //! - a node's box contains the boxes of its children and items.
 
-use crate::{Bounds, Bounds32, wide::WideHierarchy};
+use bytemuck::{Pod, Zeroable};
+
+use crate::{
+    Array, Bounds, Bounds32,
+    wide::{WideHierarchy, WideNode},
+};
 
 /// One node, 32 bytes. `count == 0`: inner, children `first` and `first + 1`.
 /// `count > 0`: leaf over the items `first..first + count`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Node {
     /// Box of everything below.
@@ -41,7 +46,7 @@ impl Node {
 #[derive(Clone, Debug, Default)]
 pub struct Hierarchy {
     /// Nodes; empty for no items.
-    pub nodes: Vec<Node>,
+    pub nodes: Array<Node>,
     /// Largest number of nodes on a path from the root to a leaf; a walk's stack needs no more.
     pub depth: usize,
     /// The same with four children a node, for rays.
@@ -95,31 +100,44 @@ impl Hierarchy {
         let deepest_split = 2 * (usize::BITS - boxes.len().leading_zeros()) as usize;
 
         let unknown = Node { bounds: EMPTY, first: 0, count: 0 };
-        let nodes = Vec::with_capacity(boxes.len());
-        let mut out = Self { nodes, ..Self::default() };
-        out.nodes.push(unknown);
+        let mut nodes = Vec::with_capacity(boxes.len());
+        let mut deepest = 0;
+        nodes.push(unknown);
         // Depth first, left before right: items come out in the order a walk meets them.
         let mut stack = vec![(0usize, 0..items.len(), 1usize)];
         while let Some((node, range, depth)) = stack.pop() {
-            out.depth = out.depth.max(depth);
+            deepest = deepest.max(depth);
             let here = &mut items[range.clone()];
             let mut bounds = EMPTY;
             here.iter().for_each(|item| grow(&mut bounds, &item.bounds));
             if here.len() <= leaf_items {
                 let (first, count) = (range.start as u32, range.len() as u32);
-                out.nodes[node] = Node { bounds, first, count };
+                nodes[node] = Node { bounds, first, count };
                 continue;
             }
             let split = if depth <= deepest_split { split(here, &mut scratch) } else { None };
             let middle = range.start + split.unwrap_or(here.len() / 2);
-            let left = out.nodes.len();
-            out.nodes.extend([unknown, unknown]);
-            out.nodes[node] = Node { bounds, first: left as u32, count: 0 };
+            let left = nodes.len();
+            nodes.extend([unknown, unknown]);
+            nodes[node] = Node { bounds, first: left as u32, count: 0 };
             stack.push((left + 1, middle..range.end, depth + 1));
             stack.push((left, range.start..middle, depth + 1));
         }
-        out.wide = WideHierarchy::new(&out);
+        let wide = WideHierarchy::new(&nodes);
+        let out = Self { nodes: nodes.into(), depth: deepest, wide };
         (out, items.iter().map(|item| item.number).collect())
+    }
+
+    /// A hierarchy of its parts, as [`Hierarchy::wide_nodes`] and its fields gave them.
+    #[must_use]
+    pub fn of_parts(nodes: Array<Node>, depth: usize, wide: Array<WideNode>) -> Self {
+        Self { nodes, depth, wide: WideHierarchy { nodes: wide } }
+    }
+
+    /// The nodes that rays walk.
+    #[must_use]
+    pub fn wide_nodes(&self) -> &Array<WideNode> {
+        &self.wide.nodes
     }
 
     /// Calls `found` with every item whose leaf's box meets `query` (same space), in order.

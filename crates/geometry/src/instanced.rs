@@ -12,13 +12,13 @@
 //! two top-level hierarchies: the first hide what is behind them, the second never do. Those that move
 //! are in two more, whose nodes have a box at each key frame: what rests never pays for motion.
 
-use std::ops::Range;
+use std::{ops::Range, sync::Arc};
 
 use glam::{DAffine3, DVec3};
 
 use crate::{
-    Bounds, Bounds32, Hierarchy, InstanceId, MeshId, Moment, MovingHierarchy, ObjectId,
-    ParticleSystem, PrimitiveId,
+    Array, Bounds, Bounds32, Hierarchy, InstanceId, MeshId, Moment, MovingHierarchy, ObjectId,
+    ParticleSystem, PrimitiveId, Residency,
     hierarchy::{INSTANCES_A_LEAF, TRIANGLES_A_LEAF},
     motion::{around, lerp, lerp_transform},
 };
@@ -59,9 +59,9 @@ pub enum Place {
 #[derive(Clone, Debug)]
 pub struct Mesh {
     /// Vertex positions, mesh space, metres; those of the first key frame.
-    pub positions: Vec<[f32; 3]>,
+    pub positions: Array<[f32; 3]>,
     /// Vertex indices a triangle, in hierarchy order.
-    pub triangles: Vec<[u32; 3]>,
+    pub triangles: Array<[u32; 3]>,
     /// Hierarchy over the triangles; without nodes where they move.
     pub hierarchy: Hierarchy,
     /// Box of the triangles at all key frames, mesh space.
@@ -94,6 +94,7 @@ impl Mesh {
         let (hierarchy, order) = Hierarchy::build(&boxes, TRIANGLES_A_LEAF);
         let bounds = boxes.iter().fold(Bounds::EMPTY, |b, x| b.union(x.widen()));
         let triangles = order.iter().map(|&t| triangles[t as usize]).collect();
+        let positions = positions.into();
         (Self { positions, triangles, hierarchy, bounds, motion: None }, order)
     }
 
@@ -119,7 +120,7 @@ impl Mesh {
             hierarchy.swept(0, 0..keys.len() as u32 - 1).widen()
         };
         let triangles = order.iter().map(|&t| triangles[t as usize]).collect();
-        let positions = keys[0].clone();
+        let positions = keys[0].clone().into();
         let motion = Some(MeshMotion { keys, hierarchy, moves });
         (Self { positions, triangles, hierarchy: Hierarchy::default(), bounds, motion }, order)
     }
@@ -310,6 +311,8 @@ pub struct InstancedGeometry {
     /// that size, so it can be off by that many roundings even if the sum is close to the viewer:
     /// that is so for meshes that stand far from their own origin.
     pub placement_reach: f64,
+    /// Who keeps it within its memory, where parts of it are mapped.
+    pub residency: Option<Arc<dyn Residency>>,
     /// One placement an instance, or none at all above [`PLACEMENTS_MAX`] instances.
     placements: Vec<Placement>,
 }
@@ -419,7 +422,16 @@ impl InstancedGeometry {
             states,
             bounds,
             placement_reach,
+            residency: None,
             placements,
+        }
+    }
+
+    /// To be called by who walks it, after at most [`STEPS`](crate::STEPS) steps.
+    #[inline(always)]
+    pub fn look(&self) {
+        if let Some(residency) = &self.residency {
+            residency.look();
         }
     }
 

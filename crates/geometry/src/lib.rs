@@ -13,6 +13,7 @@
 //! - VI-2: closed meshes do not leak.
 //! - VI-3: output does not depend on worker, thread count or order.
 
+mod array;
 mod bounds;
 mod frame;
 mod hierarchy;
@@ -22,6 +23,7 @@ pub mod motion;
 pub mod overlap;
 mod particles;
 pub mod raycast;
+mod residency;
 mod set;
 mod state_sets;
 mod timeline;
@@ -29,6 +31,7 @@ mod units;
 mod view;
 mod wide;
 
+pub use array::{Array, Holder};
 pub use bounds::{Bounds, Bounds32};
 pub use frame::{FACE_COUNT, Face, RectifiedFrame, Sampling};
 pub use hierarchy::{Hierarchy, Node};
@@ -39,11 +42,13 @@ pub use instanced::{
 pub use motion::{Moment, MovingHierarchy, MovingNode};
 pub use particles::{ParticleSystem, Sphere};
 pub use raycast::{Hit, Ray};
+pub use residency::{Residency, STEPS};
 pub use set::{PrimitiveSet, Run};
 pub use state_sets::StateSets;
 pub use timeline::Timeline;
 pub use units::{CLUSTER_PRIMITIVES, Granularity, Units};
 pub use view::{ViewCell, ViewSegment};
+pub use wide::WideNode;
 
 /// Unit roundoff of `f64`, 2^-53: the relative error of one correctly rounded operation.
 pub const UNIT_ROUNDOFF: f64 = f64::EPSILON / 2.0;

@@ -91,6 +91,7 @@ fn collect(
 ) {
     let relative = Bounds { min: bounds.min - geometry.origin, max: bounds.max - geometry.origin };
     top.hierarchy.items_in(relative, |item| {
+        geometry.look();
         let instance = &geometry.instances[top.instances[item].index()];
         let mesh = &geometry.meshes[instance.mesh.index()];
         let local = bounds.transformed(&instance.world_from_mesh.inverse());

@@ -19,7 +19,8 @@ pub use moving::mesh_space;
 use glam::{DMat3, DVec3};
 
 use crate::{
-    InstanceId, InstancedGeometry, Mesh, Moment, MovingLevel, PrimitiveId, TopLevel, UNIT_ROUNDOFF,
+    InstanceId, InstancedGeometry, Mesh, Moment, MovingLevel, PrimitiveId, STEPS, TopLevel,
+    UNIT_ROUNDOFF,
     instanced::Placement,
     wide::{Child, WIDTH, WideHierarchy, WideNode},
 };
@@ -227,6 +228,8 @@ struct Cast<'a> {
 /// Scratch memory of a caster; keep one a thread.
 #[derive(Default)]
 pub struct RayCaster {
+    /// Rays since the last look at the memory.
+    rays: u64,
     top: Vec<Open>,
     bottom: Vec<Open>,
     moving: moving::Stacks,
@@ -247,6 +250,11 @@ impl RayCaster {
         accept: &mut impl FnMut(PrimitiveId) -> bool,
         visit: &mut impl FnMut(Hit, f64) -> f64,
     ) {
+        // A ray takes some tens of steps.
+        self.rays += 1;
+        if self.rays.is_multiple_of(STEPS / 32) {
+            cast.geometry.look();
+        }
         let limit = self.visit_moving(cast, accept, visit);
         let cast = &Cast { limit, ..*cast };
         #[cfg(target_arch = "x86_64")]

@@ -69,9 +69,16 @@ impl Units {
                 units.meshes = geometry
                     .meshes
                     .iter()
-                    .map(|mesh| match &mesh.motion {
-                        None => clusters(mesh.hierarchy.nodes.iter().map(|n| (n.first, n.count))),
-                        Some(m) => clusters(m.hierarchy.nodes.iter().map(|n| (n.first, n.count))),
+                    .map(|mesh| {
+                        geometry.look();
+                        match &mesh.motion {
+                            None => {
+                                clusters(mesh.hierarchy.nodes.iter().map(|n| (n.first, n.count)))
+                            }
+                            Some(m) => {
+                                clusters(m.hierarchy.nodes.iter().map(|n| (n.first, n.count)))
+                            }
+                        }
                     })
                     .collect();
                 units.systems = geometry

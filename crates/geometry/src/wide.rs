@@ -1,6 +1,6 @@
 //! A hierarchy with four children a node, for rays: the four boxes are tested together.
 //!
-//! Made of a binary [`Hierarchy`] by pulling grandchildren up, the largest box first; items and
+//! Made of a binary [`Hierarchy`](crate::Hierarchy) by pulling grandchildren up, the largest box first; items and
 //! their order stay what they are.
 //!
 //! Source: Dammertz, Hanika, Keller, "Shallow Bounding Volume Hierarchies for Fast SIMD Ray
@@ -10,14 +10,17 @@
 //! - the leaves are those of the binary hierarchy, each once;
 //! - a child's box is that of the binary node it came from.
 
-use crate::{Hierarchy, Node};
+use bytemuck::{Pod, Zeroable};
+
+use crate::{Array, Node};
 
 /// Children of a node.
 pub(crate) const WIDTH: usize = 4;
 
-/// What a node's place refers to.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Child {
+/// What a place of a [`WideNode`] refers to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Child {
     /// First item of a leaf, or number of an inner node.
     pub(crate) first: u32,
     /// Items of a leaf, 0 for an inner node.
@@ -25,12 +28,13 @@ pub(crate) struct Child {
 }
 
 /// One node, two cache lines.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C, align(64))]
-pub(crate) struct WideNode {
+pub struct WideNode {
     /// Least x, y, z, then largest x, y, z, a child each. Places without a child hold a box that
     /// nothing meets.
     pub(crate) bounds: [[f32; WIDTH]; 6],
+    /// What is there.
     pub(crate) children: [Child; WIDTH],
 }
 
@@ -61,13 +65,13 @@ impl WideNode {
 /// Nodes of a wide hierarchy; node 0 is the root. Empty for no items.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct WideHierarchy {
-    pub(crate) nodes: Vec<WideNode>,
+    pub(crate) nodes: Array<WideNode>,
 }
 
 impl WideHierarchy {
     /// The wide hierarchy over the same items.
-    pub(crate) fn new(binary: &Hierarchy) -> Self {
-        let Some(root) = binary.nodes.first() else { return Self::default() };
+    pub(crate) fn new(binary: &[Node]) -> Self {
+        let Some(root) = binary.first() else { return Self::default() };
         let mut nodes = vec![WideNode::EMPTY];
         // (binary node, its wide node). The root alone may be a leaf.
         let mut open = Vec::new();
@@ -79,7 +83,7 @@ impl WideHierarchy {
         while let Some((from, to)) = open.pop() {
             let (places, len) = children(binary, from);
             for (place, &number) in places[..len].iter().enumerate() {
-                let node = &binary.nodes[number as usize];
+                let node = &binary[number as usize];
                 let child = if node.is_leaf() {
                     Child { first: node.first, count: node.count }
                 } else {
@@ -92,13 +96,13 @@ impl WideHierarchy {
             }
         }
         nodes.shrink_to_fit();
-        Self { nodes }
+        Self { nodes: nodes.into() }
     }
 }
 
 /// The binary nodes below an inner one that become its children, and how many they are.
-fn children(binary: &Hierarchy, from: u32) -> ([u32; WIDTH], usize) {
-    let node = |number: u32| &binary.nodes[number as usize];
+fn children(binary: &[Node], from: u32) -> ([u32; WIDTH], usize) {
+    let node = |number: u32| &binary[number as usize];
     let first = node(from).first;
     let mut places = [first, first + 1, 0, 0];
     let mut len = 2;
@@ -117,12 +121,12 @@ fn children(binary: &Hierarchy, from: u32) -> ([u32; WIDTH], usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Bounds32, hierarchy::TRIANGLES_A_LEAF};
+    use crate::{Bounds32, Hierarchy, hierarchy::TRIANGLES_A_LEAF};
 
     /// Item ranges of the leaves below a node, and the boxes of the leaves.
     fn leaves(wide: &WideHierarchy) -> Vec<(u32, u32, [[f32; 3]; 2])> {
         let mut found = vec![];
-        for node in &wide.nodes {
+        for node in wide.nodes.iter() {
             for (place, child) in node.children.iter().enumerate() {
                 if child.count > 0 {
                     let corner = |upper: usize| [0, 1, 2].map(|k| node.bounds[upper + k][place]);
@@ -152,7 +156,7 @@ mod tests {
                 .collect();
             let mut of_binary = of_binary;
             of_binary.sort_by_key(|leaf| leaf.0);
-            let wide = WideHierarchy::new(&binary);
+            let wide = WideHierarchy::new(&binary.nodes);
             assert_eq!(leaves(&wide), of_binary);
             let inner =
                 wide.nodes.iter().flat_map(|n| n.children).filter(|c| c.first > 0 && c.count == 0);

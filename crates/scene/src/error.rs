@@ -10,7 +10,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use crate::particles::TableProblem;
+use crate::{memory::ByteSize, particles::TableProblem};
 
 /// A scene that was refused.
 #[derive(Debug)]
@@ -67,6 +67,30 @@ pub enum Cause {
     /// A particle table is refused.
     #[error(transparent)]
     Table(#[from] TableProblem),
+
+    /// The system does not say how much memory the process takes.
+    #[error("a memory limit needs the sizes in /proc/self/statm: {source}")]
+    MemoryUnknown {
+        /// The operating system's reason.
+        source: io::Error,
+    },
+    /// What of a scene stays in memory leaves no room for the rest.
+    #[error("the scene needs at least {}, and the memory limit is {}", ByteSize(*.needed),
+        ByteSize(*.limit))]
+    OutOfMemory {
+        /// Bytes that would do.
+        needed: u64,
+        /// The limit.
+        limit: u64,
+    },
+    /// A chunk file cannot be written or read.
+    #[error("the chunk file {}: {source}", file.display())]
+    ChunkFile {
+        /// Its path.
+        file: PathBuf,
+        /// The operating system's reason.
+        source: io::Error,
+    },
 
     /// A GLB file ends before the length that it states.
     #[error("the GLB container is cut short: {what} needs {needed} bytes, {available} are there")]
@@ -654,6 +678,17 @@ impl SceneError {
                     .into()
             }
             Cause::Table(problem) => problem.help().into(),
+            Cause::MemoryUnknown { .. } => {
+                "a memory limit can be kept on Linux, with /proc; leave the limit away".into()
+            }
+            Cause::OutOfMemory { .. } => {
+                "give a higher limit; instances, what moves and particles stay in memory, and a mesh \
+                 is in memory while its hierarchy is made"
+                    .into()
+            }
+            Cause::ChunkFile { .. } => {
+                "give a folder on a disk with room for about 100 bytes a triangle with --chunks".into()
+            }
             Cause::Pattern { .. } => {
                 "patterns are globs: `*` and `**` match any text, `?` one character, `{a,b}` \
                  alternatives; write `[*]` for a literal star"

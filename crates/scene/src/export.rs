@@ -222,7 +222,7 @@ pub fn export_visible_with(
     let parts = container::split(&main).map_err(in_source)?;
     let document = document::Document::parse(parts.json).map_err(in_source)?;
     let buffers =
-        buffers::Buffers::load(source, &main, parts.binary, &document).map_err(in_source)?;
+        buffers::Buffers::load(source, &main, parts.binary, &document, None).map_err(in_source)?;
     // Behind the files of the source, the digest lists the particle tables.
     let files = scene.digest.files.len() - scene.particles.len();
     let own = crate::SceneDigest::of_files(buffers.files().to_vec());

@@ -11,6 +11,7 @@ mod error;
 pub mod export;
 pub mod generate;
 mod gltf_reader;
+mod memory;
 mod numbering;
 pub mod particles;
 pub mod region;
@@ -19,6 +20,7 @@ mod scene;
 
 pub use digest::{FileDigest, SceneDigest, digest, digest_with, external_buffers};
 pub use error::{Cause, Place, SceneError, UriProblem};
+pub use memory::{ByteSize, Held, Keeper, MemoryLimit, SizeError, default_folder};
 pub use numbering::morton;
 pub use particles::{ParticleSource, TableProblem};
 pub use report::{DegenerateTriangles, IgnoredChannels, IngestReport, SkippedPrimitives};

@@ -16,11 +16,15 @@
 use std::{
     ops::Range,
     path::{Path, PathBuf},
+    sync::Arc,
 };
 
-use sightline_geometry::{Bounds, Bounds32, InstancedGeometry, Moment, ObjectId};
+use sightline_geometry::{Array, Bounds, Bounds32, InstancedGeometry, Moment, ObjectId, Residency};
 
-use crate::{IngestReport, ParticleSource, SceneDigest, SceneError, gltf_reader, particles};
+use crate::{
+    IngestReport, Keeper, MemoryLimit, ParticleSource, SceneDigest, SceneError, gltf_reader,
+    memory, particles,
+};
 
 /// How a scene is to be read.
 #[derive(Clone, Debug)]
@@ -51,6 +55,9 @@ pub struct OpenOptions {
     /// on their own and corners of the boxes of moving instances, once a key frame. A position takes
     /// 12 bytes.
     pub max_moving_positions: u64,
+    /// How much memory the process may take; everything is in memory when absent. See
+    /// [`MemoryLimit`].
+    pub memory: Option<MemoryLimit>,
 }
 
 impl Default for OpenOptions {
@@ -67,6 +74,7 @@ impl Default for OpenOptions {
             motion_error: 0.01,
             max_states: 4096,
             max_moving_positions: 1 << 28,
+            memory: None,
         }
     }
 }
@@ -157,7 +165,7 @@ pub struct MeshSource {
     pub primitive: u32,
     /// Our number of a triangle in the mesh to its number in the glTF primitive, where the
     /// triangles of strips and fans are counted in order, and degenerate ones count.
-    pub triangles: Vec<u32>,
+    pub triangles: Array<u32>,
 }
 
 /// Where an instance of the geometry comes from.
@@ -197,6 +205,8 @@ pub struct Scene {
     pub report: IngestReport,
     /// Hashes of the files.
     pub digest: SceneDigest,
+    /// Who keeps the process within its memory, where there is a limit.
+    pub memory: Option<Arc<Keeper>>,
 }
 
 impl Scene {
@@ -207,12 +217,29 @@ impl Scene {
     /// When a file cannot be read, breaks a rule of its format that the geometry depends on, or is
     /// too large; see [`crate::Cause`].
     pub fn open(path: &Path, options: &OpenOptions) -> Result<Self, SceneError> {
-        let read = if particles::is_table(path) {
-            particles::read_scene(path, options)
-        } else {
-            gltf_reader::read(path, options)
-        };
-        read.map_err(|e| e.in_file(path))
+        Self::kept(options, |keeper| {
+            if particles::is_table(path) {
+                particles::read_scene(path, options)
+            } else {
+                gltf_reader::read(path, options, keeper)
+            }
+        })
+        .map_err(|e| e.in_file(path))
+    }
+
+    /// Reads a scene within the memory that the options allow.
+    fn kept(
+        options: &OpenOptions,
+        read: impl FnOnce(Option<&Arc<Keeper>>) -> Result<Self, SceneError>,
+    ) -> Result<Self, SceneError> {
+        let keeper = memory::keeper(options.memory.as_ref())?;
+        let mut scene = read(keeper.as_ref())?;
+        if let Some(keeper) = keeper {
+            keeper.expect_room(0)?;
+            scene.geometry.residency = Some(Arc::clone(&keeper) as Arc<dyn Residency>);
+            scene.memory = Some(keeper);
+        }
+        Ok(scene)
     }
 
     /// As [`Scene::open`], with the content of the main file in `main`; external buffers are
@@ -221,12 +248,14 @@ impl Scene {
     /// # Errors
     /// As [`Scene::open`].
     pub fn open_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Self, SceneError> {
-        let read = if particles::is_table(path) {
-            particles::read_scene_bytes(path, main, options)
-        } else {
-            gltf_reader::read_bytes(path, main, options)
-        };
-        read.map_err(|e| e.in_file(path))
+        Self::kept(options, |keeper| {
+            if particles::is_table(path) {
+                particles::read_scene_bytes(path, main, options)
+            } else {
+                gltf_reader::read_bytes(path, main, options, keeper)
+            }
+        })
+        .map_err(|e| e.in_file(path))
     }
 
     /// The moment at a time in seconds; times before the first key frame are taken for it, times
@@ -318,7 +347,7 @@ impl Scene {
         }
         for (mesh, motion) in g.meshes.iter().filter_map(|m| Some((m, m.motion.as_ref()?))) {
             assert_eq!(motion.keys.len(), keys);
-            assert_eq!(motion.keys[0], mesh.positions, "at the first key frame");
+            assert_eq!(motion.keys[0], *mesh.positions, "at the first key frame");
             let same = |key: &Vec<[f32; 3]>| key.len() == mesh.positions.len();
             assert!(motion.keys.iter().all(same), "every vertex has a place a key frame");
             assert!(motion.moves.contains(&true), "what does not move has one value");

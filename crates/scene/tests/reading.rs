@@ -105,7 +105,7 @@ fn degenerate_triangles_are_dropped_and_counted_and_others_keep_their_numbers() 
     let report = &scene.report;
     assert_eq!((report.degenerate_triangles, report.unique_triangles), (2, 2));
     assert_eq!(report.degenerate[0].triangles, [0, 1]);
-    let mut sources = scene.meshes[0].triangles.clone();
+    let mut sources = scene.meshes[0].triangles.to_vec();
     sources.sort_unstable();
     assert_eq!(sources, [2, 3]);
 }

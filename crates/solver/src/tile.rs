@@ -31,7 +31,7 @@ use std::cmp::Ordering;
 
 use glam::{DMat3, DVec3};
 use sightline_geometry::{
-    Face, InstanceId, InstancedGeometry, Mesh, Node, RectifiedFrame, TopLevel,
+    Face, InstanceId, InstancedGeometry, Mesh, Node, RectifiedFrame, STEPS, TopLevel,
 };
 
 use crate::{
@@ -295,6 +295,7 @@ impl TileSolver {
         self.aim(context, w, c);
         self.envelopes.clear(pixels);
         self.seen_through.clear();
+        context.geometry.look();
 
         self.walk(context, &context.geometry.occluders, Pass::Occluders);
         if !context.geometry.see_through.instances.is_empty() {
@@ -509,9 +510,14 @@ impl TileSolver {
     fn walk(&mut self, context: &TileContext, top: &TopLevel, pass: Pass) {
         let geometry = context.geometry;
         let Some(face_from_world) = self.enter_world(context, top) else { return };
+        let mut look_at = self.counters.nodes + STEPS;
         while let Some(entry) = self.stack.pop() {
             if self.is_hidden(&entry) {
                 continue;
+            }
+            if self.counters.nodes >= look_at {
+                look_at = self.counters.nodes + STEPS;
+                geometry.look();
             }
             let nodes = self.nodes_of(geometry, top, entry.space);
             let node = nodes[entry.node as usize];

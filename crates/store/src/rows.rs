@@ -8,7 +8,7 @@ use std::cmp::Reverse;
 use std::ops::Range;
 
 use sightline_geometry::{
-    Bounds, CellId, MeshId, ObjectId, PrimitiveId, PrimitiveSet, SegmentId, ViewCell,
+    Array, Bounds, CellId, MeshId, ObjectId, PrimitiveId, PrimitiveSet, SegmentId, ViewCell,
 };
 
 use crate::Weight;
@@ -225,7 +225,7 @@ pub struct NumberedMesh {
     /// Number of the primitive within the glTF mesh.
     pub gltf_primitive: u32,
     /// For each triangle in Sightline's order, its number in the glTF primitive.
-    pub triangles: Vec<u32>,
+    pub triangles: Array<u32>,
 }
 
 /// From primitive numbers to the triangles of the glTF file.

@@ -1078,13 +1078,15 @@ pub(crate) fn mesh_rows(
         let id = MeshId(ids[row]);
         match meshes.last_mut() {
             Some(last) if last.id == id && last.triangles.len() == first[row] as usize => {
-                last.triangles.extend_from_slice(triangles);
+                let mut all = std::mem::take(&mut last.triangles).into_vec();
+                all.extend_from_slice(triangles);
+                last.triangles = all.into();
             }
             _ if first[row] == 0 => meshes.push(NumberedMesh {
                 id,
                 gltf_mesh: gltf_meshes[row],
                 gltf_primitive: gltf_primitives[row],
-                triangles: triangles.to_vec(),
+                triangles: triangles.to_vec().into(),
             }),
             _ => {
                 let problem = format!("the triangles of mesh {id} are not in order");

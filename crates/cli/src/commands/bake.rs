@@ -12,7 +12,7 @@ use sightline_coordinator::{
     Coordinator, CoordinatorHandle, CoordinatorOptions, Prepared, Summary as Ended, prepare_from,
 };
 use sightline_jobs::{BakeConfig, BakeStatus, Done, Phase, Plan};
-use sightline_scene::SceneDigest;
+use sightline_scene::{Keeper, SceneDigest};
 use sightline_store::{BakeStore, Dataset};
 use sightline_worker::{Worker, WorkerOptions};
 use tokio::sync::oneshot;
@@ -22,7 +22,7 @@ use super::changes::{Before, since_last_bake};
 use super::dataset::Summary;
 use crate::arguments::{Bake, BakeInput};
 use crate::failure::{Failure, Kind, Result};
-use crate::memory::Phases;
+use crate::memory::{Phases, add_held, held_json};
 use crate::progress::{Progress, note};
 use crate::report::{Table, count, print, print_json, thousands};
 
@@ -49,6 +49,7 @@ pub struct Baked {
     ended: Ended,
     summary: Summary,
     phases: Phases,
+    memory: Option<Arc<Keeper>>,
 }
 
 /// Bakes on this machine, from reading the scene to the published dataset.
@@ -57,6 +58,7 @@ pub fn bake(input: &BakeInput, threads: Option<u32>, joining: &Joining) -> Resul
     let mut phases = Phases::start("read and plan");
     let prepared = prepare_on(input, config, threads)?;
     let plan = prepared.plan.clone();
+    let memory = prepared.scene.memory.clone();
     let runtime = super::runtime()?;
     let (ended, summary) = runtime.block_on(async {
         let store = open_store(input, &prepared.scene.digest, &plan).await?;
@@ -67,7 +69,8 @@ pub fn bake(input: &BakeInput, threads: Option<u32>, joining: &Joining) -> Resul
         Ok::<_, Failure>((ended, summary))
     })?;
     phases.finish();
-    Ok(Baked { out: sightline_store::redacted(&input.out), plan, ended, summary, phases })
+    let out = sightline_store::redacted(&input.out);
+    Ok(Baked { out, plan, ended, summary, phases, memory })
 }
 
 /// The configuration: the file, overruled by flags.
@@ -98,7 +101,8 @@ pub fn prepare_on(input: &BakeInput, config: BakeConfig, threads: Option<u32>) -
         true => input.scene.to_string_lossy().into_owned(),
         false => absolute(&found.path).display().to_string(),
     };
-    Ok(super::on_threads(threads, || prepare_from(&absolute(&found.path), &uri, config))??)
+    let (path, memory) = (absolute(&found.path), input.memory.limit());
+    Ok(super::on_threads(threads, || prepare_from(&path, &uri, config, memory))??)
 }
 
 fn absolute(path: &Path) -> PathBuf {
@@ -285,6 +289,7 @@ impl Baked {
             "worker_solve_ms": status.worker_solve_ms,
             "summary": self.summary.to_json(),
             "time": self.phases.to_json(),
+            "memory": held_json(self.memory.as_deref()),
         })
     }
 
@@ -303,6 +308,9 @@ impl Baked {
         }
         table.gap();
         self.phases.add_to(&mut table);
+        if let Some(keeper) = &self.memory {
+            add_held(&mut table, &keeper.held());
+        }
         table.to_string()
     }
 }

@@ -15,6 +15,7 @@ use sightline_worker::{Worker, WorkerOptions};
 use super::bake::{open_store, prepare_on, read_config, stop_signal, watch};
 use crate::arguments::{Coordinator as CoordinatorCommand, Worker as WorkerCommand};
 use crate::failure::{Failure, Kind, Result};
+use crate::memory::add_held;
 use crate::progress::note;
 use crate::report::{Table, count, duration, print, thousands};
 
@@ -89,6 +90,7 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
     options.scene_path.clone_from(&command.scene);
     options.scene_access = command.cache.access(command.fetch_scene);
     options.store = command.out.as_deref().map(BakeStore::open).transpose()?;
+    options.memory = command.memory.limit();
     options.threads = command.threads.unwrap_or(0) as usize;
     options.name =
         command.name.clone().unwrap_or_else(|| format!("process {}", std::process::id()));
@@ -120,6 +122,9 @@ pub fn run_worker(command: &WorkerCommand) -> Result<()> {
         .row("tasks", thousands(summary.tasks))
         .row("failed attempts", thousands(summary.failures))
         .row("solving", duration(summary.solve_time.as_secs_f64()));
+    if let Some(held) = &summary.held {
+        add_held(&mut table, held);
+    }
     print(&table.to_string());
     if stopped.load(Ordering::Relaxed) {
         // Not a success: a platform that starts workers must not take it for the end of the bake.

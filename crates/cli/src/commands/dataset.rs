@@ -27,7 +27,8 @@ pub async fn open(location: &str) -> Result<Dataset> {
 pub async fn open_with_scene(input: &DatasetInput) -> Result<(Dataset, Scene, SceneOnDisk)> {
     let dataset = open(&input.dataset).await?;
     let found = find_scene(&dataset, input).await?;
-    let options = found.with_tables(open_options(dataset.manifest(), &found.path));
+    let mut options = found.with_tables(open_options(dataset.manifest(), &found.path));
+    options.memory = input.memory.limit();
     let scene = Scene::open(&found.path, &options)?;
     expect_digest(dataset.manifest(), &scene.digest, &found.path)?;
     Ok((dataset, scene, found))

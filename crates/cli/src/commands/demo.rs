@@ -8,7 +8,7 @@ use super::bake::bake;
 use super::dataset::open_with_scene;
 use super::{export, generate, verify};
 use crate::arguments::{
-    BakeInput, CacheFlags, CellChoice, ConfigFlags, DatasetInput, Demo, Verify,
+    BakeInput, CacheFlags, CellChoice, ConfigFlags, DatasetInput, Demo, MemoryFlags, Verify,
 };
 use crate::failure::{Failure, Kind, Result};
 use crate::progress::note;
@@ -34,6 +34,7 @@ pub fn run(command: &Demo) -> Result<()> {
         scene: scene.clone(),
         out: out.clone(),
         config: None,
+        memory: MemoryFlags::default(),
         keys: configuration(made.suggested_region, made.suggested_eye_height),
         cache: CacheFlags::default(),
     };
@@ -45,6 +46,7 @@ pub fn run(command: &Demo) -> Result<()> {
         dataset: out.clone(),
         scene: Some(scene.clone()),
         cache: CacheFlags::default(),
+        memory: MemoryFlags::default(),
     };
     let check = verification(dataset, command.threads);
     let runtime = super::runtime()?;

@@ -18,6 +18,7 @@ use sightline_store::{CellRow, Dataset};
 use super::dataset::open_with_scene;
 use crate::arguments::{CellChoice, Verify};
 use crate::failure::{Failure, Kind, Result};
+use crate::memory::{add_held, held_json};
 use crate::progress::Progress;
 use crate::report::{Table, count, duration, percent, print, print_json, thousands};
 
@@ -90,9 +91,16 @@ pub fn run(command: &Verify) -> Result<()> {
         super::on_threads(command.threads, || measure(&runtime, &dataset, &scene, command))??;
     let exceeded = exceeded(&findings, command);
     if command.json {
-        print_json(&to_json(&findings, command, &exceeded));
+        let mut found = to_json(&findings, command, &exceeded);
+        found["memory"] = held_json(scene.memory.as_deref());
+        print_json(&found);
     } else {
-        print(&to_text(&findings, command));
+        let mut table = Table::default();
+        if let Some(keeper) = &scene.memory {
+            table.gap();
+            add_held(&mut table, &keeper.held());
+        }
+        print(&format!("{}{table}", to_text(&findings, command)));
     }
     if exceeded.is_empty() {
         return Ok(());

@@ -216,9 +216,9 @@ impl<'a> Meshes<'a> {
 
     /// Ascending numbers of a subset's triangles in the glTF primitive.
     fn triangle_numbers(&self, subset: &Subset) -> Vec<u32> {
-        let of_file = &self.scene.meshes[subset.body as usize].triangles;
+        let of_file = &*self.scene.meshes[subset.body as usize].triangles;
         let mut numbers = match &subset.triangles {
-            None => of_file.clone(),
+            None => of_file.to_vec(),
             Some(chosen) => chosen.iter().map(|&t| of_file[t as usize]).collect(),
         };
         numbers.sort_unstable();

@@ -64,7 +64,7 @@ impl Kind {
     #[must_use]
     pub const fn triangle_range(self) -> RangeInclusive<u64> {
         match self {
-            Self::City => 20_000..=6_000_000,
+            Self::City => 20_000..=40_000_000,
             Self::Town => 50_000..=6_000_000,
             Self::Grass | Self::SwayingGrass { .. } => 20_000..=100_000_000,
         }

@@ -135,6 +135,7 @@ pub fn scene(
         key_times,
         report,
         digest,
+        memory: None,
     })
 }
 

@@ -4,7 +4,10 @@
 //! the fallback of a compression extension may be absent. Views are decompressed at their first
 //! use and kept.
 
-use std::{path::Path, sync::OnceLock};
+use std::{
+    path::Path,
+    sync::{Arc, OnceLock},
+};
 
 use serde::Deserialize;
 
@@ -13,7 +16,10 @@ use super::{
     meshopt_view::{self, MeshoptView},
     uri::{self, Target},
 };
-use crate::{Cause, SceneError};
+use crate::{
+    Cause, Keeper, SceneError,
+    memory::{self, Content},
+};
 
 /// The two names of the same compression.
 const MESHOPT: [&str; 2] = ["EXT_meshopt_compression", "KHR_meshopt_compression"];
@@ -32,6 +38,8 @@ enum Bytes<'a> {
     Chunk(&'a [u8]),
     /// An external file or a data URI.
     Owned(Vec<u8>),
+    /// An external file, perhaps mapped.
+    File(Content),
     /// The same file as an earlier buffer.
     Shared(usize),
     /// No data: a placeholder.
@@ -54,6 +62,69 @@ struct Fallback {
     fallback: bool,
 }
 
+fn target(buffer: u32, uri: &str) -> Result<Target, SceneError> {
+    let refused = |problem| Cause::BufferUri { buffer, uri: shorten(uri), problem };
+    uri::resolve(uri).map_err(|problem| refused(problem).into())
+}
+
+/// What `read` makes of an external file; nothing where it is not there and need not be.
+fn external<T>(
+    document: &Document,
+    path: &Path,
+    buffer: u32,
+    name: &str,
+    read: impl FnOnce(&Path) -> std::io::Result<T>,
+) -> Result<Option<T>, SceneError> {
+    let file = path.parent().unwrap_or(Path::new("")).join(name);
+    let read = || {
+        // Opening a named pipe would wait for a writer.
+        if !std::fs::metadata(&file)?.is_file() {
+            return Err(std::io::Error::other("not a regular file"));
+        }
+        read(&file)
+    };
+    match read() {
+        Ok(content) => Ok(Some(content)),
+        Err(_) if is_fallback(document, buffer)? => Ok(None),
+        Err(source) => Err(Cause::MissingBuffer { buffer, file, source }.into()),
+    }
+}
+
+fn is_fallback(document: &Document, buffer: u32) -> Result<bool, SceneError> {
+    let extensions = document.buffers[buffer as usize].extensions.as_ref();
+    for name in MESHOPT {
+        let mark: Option<Fallback> = extension(extensions.map(|e| &e.others), name)?;
+        if mark.is_some_and(|m| m.fallback) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
+/// Name, size and hash of a file.
+pub type Hashed = (String, u64, blake3::Hash);
+
+/// What [`Buffers::files`] would give, with no file in memory as a whole. `main` is the size and the hash
+/// of the main file at `path`.
+pub fn hash_all(
+    path: &Path,
+    main: (u64, blake3::Hash),
+    document: &Document,
+) -> Result<Vec<Hashed>, SceneError> {
+    let name = path.file_name().map(|n| n.to_string_lossy().into_owned());
+    let mut files = vec![(name.unwrap_or_default(), main.0, main.1)];
+    let mut seen = std::collections::HashSet::new();
+    for (index, buffer) in (0..).zip(&document.buffers) {
+        let Some(uri) = buffer.uri.as_deref().filter(|uri| seen.insert(*uri)) else { continue };
+        if let Target::File(name) = target(index, uri)?
+            && let Some((bytes, hash)) = external(document, path, index, &name, memory::hash_file)?
+        {
+            files.push((name, bytes, hash));
+        }
+    }
+    Ok(files)
+}
+
 impl<'a> Buffers<'a> {
     /// Loads all buffers. `main` is the content of the main file at `path`.
     pub fn load(
@@ -61,9 +132,10 @@ impl<'a> Buffers<'a> {
         main: &[u8],
         binary: Option<&'a [u8]>,
         document: &'a Document,
+        keeper: Option<&Arc<Keeper>>,
     ) -> Result<Self, SceneError> {
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned());
-        let main = (name.unwrap_or_default(), main.len() as u64, blake3::hash(main));
+        let main = (name.unwrap_or_default(), main.len() as u64, memory::hash(main, keeper));
         let decoded = document.buffer_views.iter().map(|_| OnceLock::new()).collect();
         let mut buffers = Self { document, data: Vec::new(), files: vec![main], decoded };
         let mut seen = std::collections::HashMap::new();
@@ -73,7 +145,7 @@ impl<'a> Buffers<'a> {
                     Some(&first) => Bytes::Shared(first),
                     None => {
                         seen.insert(uri.as_str(), index);
-                        buffers.open(path, index as u32, uri)?
+                        buffers.open(path, index as u32, uri, keeper)?
                     }
                 },
                 (None, Some(chunk)) if index == 0 => Bytes::Chunk(chunk),
@@ -94,43 +166,22 @@ impl<'a> Buffers<'a> {
         &self.files
     }
 
-    fn open(&mut self, path: &Path, buffer: u32, uri: &str) -> Result<Bytes<'a>, SceneError> {
-        let target = uri::resolve(uri).map_err(|problem| Cause::BufferUri {
-            buffer,
-            uri: shorten(uri),
-            problem,
-        })?;
-        let name = match target {
+    fn open(
+        &mut self,
+        path: &Path,
+        buffer: u32,
+        uri: &str,
+        keeper: Option<&Arc<Keeper>>,
+    ) -> Result<Bytes<'a>, SceneError> {
+        let name = match target(buffer, uri)? {
             Target::Data(bytes) => return Ok(Bytes::Owned(bytes)),
             Target::File(name) => name,
         };
-        let file = path.parent().unwrap_or(Path::new("")).join(&name);
-        let read = || {
-            // Opening a named pipe would wait for a writer.
-            if !std::fs::metadata(&file)?.is_file() {
-                return Err(std::io::Error::other("not a regular file"));
-            }
-            std::fs::read(&file)
-        };
-        match read() {
-            Ok(bytes) => {
-                self.files.push((name, bytes.len() as u64, blake3::hash(&bytes)));
-                Ok(Bytes::Owned(bytes))
-            }
-            Err(_) if self.is_fallback(buffer)? => Ok(Bytes::Absent),
-            Err(source) => Err(Cause::MissingBuffer { buffer, file, source }.into()),
-        }
-    }
-
-    fn is_fallback(&self, buffer: u32) -> Result<bool, SceneError> {
-        let extensions = self.document.buffers[buffer as usize].extensions.as_ref();
-        for name in MESHOPT {
-            let mark: Option<Fallback> = extension(extensions.map(|e| &e.others), name)?;
-            if mark.is_some_and(|m| m.fallback) {
-                return Ok(true);
-            }
-        }
-        Ok(false)
+        let content = external(self.document, path, buffer, &name, |f| Content::of(f, keeper))?;
+        let Some(content) = content else { return Ok(Bytes::Absent) };
+        let bytes = content.bytes();
+        self.files.push((name, bytes.len() as u64, memory::hash(bytes, keeper)));
+        Ok(Bytes::File(content))
     }
 
     /// All bytes behind a buffer, also those behind its `byteLength`.
@@ -138,6 +189,7 @@ impl<'a> Buffers<'a> {
         match self.data.get(buffer)? {
             Bytes::Chunk(bytes) => Some(bytes),
             Bytes::Owned(bytes) => Some(bytes),
+            Bytes::File(content) => Some(content.bytes()),
             Bytes::Shared(first) => self.whole(*first),
             Bytes::Absent => None,
         }

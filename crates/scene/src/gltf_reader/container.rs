@@ -4,6 +4,8 @@
 //! length, its type and its bytes. The first chunk is JSON; the next, if it is `BIN\0`, is the
 //! first buffer; chunks of other types are ignored, as the specification asks.
 
+use std::{fs::File, io::Read, path::Path};
+
 use crate::{Cause, SceneError};
 
 const MAGIC: &[u8] = b"glTF";
@@ -49,6 +51,26 @@ pub fn split(file: &[u8]) -> Result<Parts<'_>, SceneError> {
         rest = behind;
     }
     Ok(Parts { json, binary })
+}
+
+/// The JSON of a main file, with no more of it in memory.
+pub fn json_of(path: &Path) -> Result<Vec<u8>, SceneError> {
+    let failed = |source| SceneError::from(Cause::Read { source });
+    let mut file = File::open(path).map_err(failed)?;
+    let mut head = Vec::new();
+    file.by_ref().take(20).read_to_end(&mut head).map_err(failed)?;
+    // As `split` reads it: the header, the header of the first chunk, and its bytes.
+    let most = match head.starts_with(MAGIC) && head.len() == 20 {
+        true => u64::from(word(&head, 12)),
+        false => u64::MAX,
+    };
+    file.take(most).read_to_end(&mut head).map_err(failed)?;
+    if head.starts_with(MAGIC) && head.len() >= 12 {
+        // What is not there is behind the JSON.
+        let length = head.len() as u32;
+        head[8..12].copy_from_slice(&length.to_le_bytes());
+    }
+    Ok(split(&head)?.json.to_vec())
 }
 
 /// Type and bytes of the first chunk, and what is behind it.

@@ -33,9 +33,13 @@ mod nodes;
 mod primitives;
 pub(crate) mod uri;
 
-use std::path::Path;
+use std::{path::Path, sync::Arc};
 
-use crate::{Cause, OpenOptions, Scene, SceneError, particles::Tables};
+use crate::{
+    Cause, Keeper, OpenOptions, Scene, SceneDigest, SceneError,
+    memory::{self, Content},
+    particles::Tables,
+};
 pub use assemble::see_through_patterns;
 
 /// Largest coordinate of a used vertex and of anything in the world, metres (a tenth of a light
@@ -43,12 +47,21 @@ pub use assemble::see_through_patterns;
 pub const MAX_COORDINATE: f64 = 1e15;
 
 /// Reads and numbers a scene.
-pub fn read(path: &Path, options: &OpenOptions) -> Result<Scene, SceneError> {
-    read_bytes(path, &read_main_file(path)?, options)
+pub fn read(
+    path: &Path,
+    options: &OpenOptions,
+    keeper: Option<&Arc<Keeper>>,
+) -> Result<Scene, SceneError> {
+    read_bytes(path, main_file(path, keeper)?.bytes(), options, keeper)
 }
 
 /// Reads and numbers a scene whose main file is in memory.
-pub fn read_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Scene, SceneError> {
+pub fn read_bytes(
+    path: &Path,
+    main: &[u8],
+    options: &OpenOptions,
+    keeper: Option<&Arc<Keeper>>,
+) -> Result<Scene, SceneError> {
     let see_through = see_through_patterns(options)?;
     let error = options.motion_error;
     if !(error > 0.0 && error.is_finite()) {
@@ -57,31 +70,49 @@ pub fn read_bytes(path: &Path, main: &[u8], options: &OpenOptions) -> Result<Sce
     let parts = container::split(main)?;
     let document = document::Document::parse(parts.json)?;
     document.check_extensions()?;
-    let buffers = buffers::Buffers::load(path, main, parts.binary, &document)?;
+    let buffers = buffers::Buffers::load(path, main, parts.binary, &document, keeper)?;
     let accessors = accessors::Accessors::new(&document, &buffers);
     let mut animations = animation::read(&document, &accessors, &options.animation)?;
     let placed = nodes::placements(&document, &accessors, &animations, options)?;
     animations.ignore_nodes_outside(|node| placed.has(node));
     let tables = Tables::read(options)?;
     let times = tables.key_times();
-    let unique = primitives::collect(&document, &accessors, &placed, &animations, &times, options)?;
+    let chunks = keeper.zip(options.memory.as_ref()).map(|(keeper, limit)| primitives::Chunks {
+        keeper,
+        limit,
+        key: memory::key(
+            &SceneDigest::of_files(buffers.files().to_vec()).combined,
+            &format!("{:?}", options.animation),
+        ),
+    });
+    let unique = primitives::collect(
+        &document,
+        &accessors,
+        &placed,
+        &animations,
+        &times,
+        options,
+        chunks.as_ref(),
+    )?;
     assemble::scene(&document, &buffers, placed, unique, tables, animations, &see_through)
 }
 
 /// Names, sizes and hashes of the files of a scene.
 pub fn files(path: &Path) -> Result<Vec<(String, u64, blake3::Hash)>, SceneError> {
-    let main = read_main_file(path)?;
-    let parts = container::split(&main)?;
-    let document = document::Document::parse(parts.json)?;
-    Ok(buffers::Buffers::load(path, &main, parts.binary, &document)?.files().to_vec())
+    expect_file(path)?;
+    let read = |source| SceneError::from(Cause::Read { source });
+    let json = container::json_of(path)?;
+    let document = document::Document::parse(&json)?;
+    let (bytes, hash) = memory::hash_file(path).map_err(read)?;
+    buffers::hash_all(path, (bytes, hash), &document)
 }
 
 /// The files that the buffers of a glTF file name, relative to its folder, in their order, each once. Of
 /// buffers whose URIs are refused there is nothing here: opening the scene says why.
 pub fn external_buffers(path: &Path) -> Result<Vec<String>, SceneError> {
-    let main = read_main_file(path)?;
-    let parts = container::split(&main)?;
-    let document = document::Document::parse(parts.json)?;
+    expect_file(path)?;
+    let json = container::json_of(path)?;
+    let document = document::Document::parse(&json)?;
     let mut names = Vec::new();
     for uri in document.buffers.iter().filter_map(|buffer| buffer.uri.as_deref()) {
         if let Ok(uri::Target::File(name)) = uri::resolve(uri)
@@ -93,11 +124,16 @@ pub fn external_buffers(path: &Path) -> Result<Vec<String>, SceneError> {
     Ok(names)
 }
 
-fn read_main_file(path: &Path) -> Result<Vec<u8>, SceneError> {
+fn main_file(path: &Path, keeper: Option<&Arc<Keeper>>) -> Result<Content, SceneError> {
+    expect_file(path)?;
+    Content::of(path, keeper).map_err(|source| Cause::Read { source }.into())
+}
+
+fn expect_file(path: &Path) -> Result<(), SceneError> {
     let read = |source| SceneError::from(Cause::Read { source });
     // Opening a named pipe would wait for a writer.
     if !std::fs::metadata(path).map_err(read)?.is_file() {
         return Err(Cause::NotAFile.into());
     }
-    std::fs::read(path).map_err(read)
+    Ok(())
 }

@@ -44,8 +44,12 @@ use super::{
     nodes::{Placed, Warnings},
 };
 use crate::{
-    Cause, DegenerateTriangles, MeshSource, OpenOptions, SceneError, SkippedPrimitives,
-    degenerate::is_degenerate, particles::merge_key_times, report::LISTED_DEGENERATE_TRIANGLES,
+    Cause, DegenerateTriangles, Keeper, MemoryLimit, MeshSource, OpenOptions, SceneError,
+    SkippedPrimitives,
+    degenerate::is_degenerate,
+    memory::{self, StoredBody},
+    particles::merge_key_times,
+    report::LISTED_DEGENERATE_TRIANGLES,
 };
 
 /// What makes the triangles of a body.
@@ -140,6 +144,7 @@ pub fn collect(
     animations: &Animations,
     table_times: &[&[f64]],
     options: &OpenOptions,
+    chunks: Option<&Chunks>,
 ) -> Result<Unique, SceneError> {
     let mut survey = Survey::default();
     for index in 0..placed.placements.len() {
@@ -155,16 +160,12 @@ pub fn collect(
     let mut order: Vec<usize> = (0..jobs.len()).collect();
     order.sort_unstable_by_key(|&j| (jobs[j].mesh, jobs[j].primitive, &jobs[j].key));
     let deforming = Deforming { skins, animations };
-    let read: Vec<Result<Read, SceneError>> = order
-        .par_iter()
-        .map(|&j| {
-            let job = &jobs[j];
-            read(job, accessors, &deforming)
-                .map_err(|e| e.at_primitive(job.mesh as usize, job.primitive as usize))
-        })
-        .collect();
-    // The first error in the order of the file, whichever thread met one first.
-    let read: Vec<Read> = read.into_iter().collect::<Result<_, _>>()?;
+    let reading = Reading { jobs: &jobs, accessors, deforming: &deforming };
+    let mut notes = Vec::new();
+    let read: Vec<Read> = match chunks {
+        None => reading.all(&order)?,
+        Some(chunks) => reading.into_chunks(&order, chunks, &mut notes)?,
+    };
     let mut read_of_job = vec![0; jobs.len()];
     for (r, &j) in order.iter().enumerate() {
         read_of_job[j] = r;
@@ -233,6 +234,7 @@ pub fn collect(
     out.drop_unplaced_bodies();
     out.rest_without_motion();
     out.warnings = warnings.sentences();
+    out.warnings.extend(notes);
     Ok(out)
 }
 
@@ -627,16 +629,7 @@ fn check_size(
 ) -> Result<(), SceneError> {
     let (mut count, mut flattened) = (0u64, 0u64);
     for job in jobs {
-        let triangles = match job.key.source {
-            Source::Plain { positions, indices, topology } => {
-                let corners = accessors.get(indices.unwrap_or(positions), || {
-                    format!("mesh {}, primitive {}", job.mesh, job.primitive)
-                })?;
-                let corners = corners.count.0;
-                if topology == Topology::Triangles { corners / 3 } else { corners }
-            }
-            Source::Draco { .. } => DRACO_GUESS,
-        };
+        let triangles = triangles_of(job, accessors)?;
         count = count.saturating_add(triangles);
         if job.key.flatten.is_some() {
             flattened = flattened.saturating_add(triangles);
@@ -651,6 +644,20 @@ fn check_size(
         return Err(Cause::TooManyFlattened { count: flattened, limit }.into());
     }
     Ok(())
+}
+
+/// Triangles of a job, by what its accessors say.
+fn triangles_of(job: &Job, accessors: &Accessors) -> Result<u64, SceneError> {
+    Ok(match job.key.source {
+        Source::Plain { positions, indices, topology } => {
+            let corners = accessors.get(indices.unwrap_or(positions), || {
+                format!("mesh {}, primitive {}", job.mesh, job.primitive)
+            })?;
+            let corners = corners.count.0;
+            if topology == Topology::Triangles { corners / 3 } else { corners }
+        }
+        Source::Draco { .. } => DRACO_GUESS,
+    })
 }
 
 /// What reading a job gives.
@@ -669,6 +676,125 @@ enum Content {
         /// Numbers of the vertices in the primitive.
         chosen: Vec<u32>,
     },
+}
+
+/// Where the triangles of what rests go when memory is limited.
+pub struct Chunks<'a> {
+    pub keeper: &'a Arc<Keeper>,
+    pub limit: &'a MemoryLimit,
+    /// What the chunk file is made from.
+    pub key: blake3::Hash,
+}
+
+/// Bytes that a triangle takes while its mesh is read and its hierarchy is built, at most.
+const MAKING: u64 = 320;
+
+/// What bodies are read from.
+#[derive(Clone, Copy)]
+struct Reading<'a> {
+    jobs: &'a [Job],
+    accessors: &'a Accessors<'a>,
+    deforming: &'a Deforming<'a>,
+}
+
+impl Reading<'_> {
+    /// Reads some jobs. An error is the first in their order, whichever thread met one first.
+    fn all(&self, order: &[usize]) -> Result<Vec<Read>, SceneError> {
+        let read: Vec<Result<Read, SceneError>> = order
+            .par_iter()
+            .map(|&j| {
+                let job = &self.jobs[j];
+                read(job, self.accessors, self.deforming)
+                    .map_err(|e| e.at_primitive(job.mesh as usize, job.primitive as usize))
+            })
+            .collect();
+        read.into_iter().collect()
+    }
+
+    /// As [`Reading::all`], with the triangles of what rests in a chunk file: so many bodies at a time are
+    /// in memory as an eighth of it takes.
+    fn into_chunks(
+        self,
+        order: &[usize],
+        chunks: &Chunks,
+        notes: &mut Vec<String>,
+    ) -> Result<Vec<Read>, SceneError> {
+        let rests = |j: &usize| self.jobs[*j].key.deform.is_none();
+        let resting: Vec<usize> = order.iter().copied().filter(rests).collect();
+        let moving: Vec<usize> = order.iter().copied().filter(|j| !rests(j)).collect();
+        let names: Vec<(u32, u32)> =
+            resting.iter().map(|&j| (self.jobs[j].mesh, self.jobs[j].primitive)).collect();
+        let Chunks { keeper, limit, key } = chunks;
+        let (stored, note) = memory::read_or_make(limit, keeper, key, &names, |file| {
+            let mut rest = &resting[..];
+            while !rest.is_empty() {
+                let (some, others) = rest.split_at(self.batch(rest, chunks)?);
+                rest = others;
+                for (read, &j) in self.all(some)?.into_iter().zip(some) {
+                    file.put(&read.into_stored(&self.jobs[j]))?;
+                }
+                keeper.look_now();
+            }
+            Ok(())
+        })?;
+        notes.extend(note);
+        let mut stored = stored.into_iter().map(Read::of_stored);
+        let mut moving = self.all(&moving)?.into_iter();
+        let next = |j: &usize| if rests(j) { stored.next() } else { moving.next() };
+        Ok(order.iter().filter_map(next).collect())
+    }
+
+    /// How many of these jobs are read together, at least one.
+    fn batch(&self, jobs: &[usize], chunks: &Chunks) -> Result<usize, SceneError> {
+        let most = chunks.limit.bytes / 8;
+        let mut bytes = 0;
+        let mut count = 0;
+        for &j in jobs {
+            let own = MAKING * triangles_of(&self.jobs[j], self.accessors)?;
+            if count == 0 {
+                let (mesh, primitive) =
+                    (self.jobs[j].mesh as usize, self.jobs[j].primitive as usize);
+                let room = chunks.keeper.expect_room(own);
+                room.map_err(|e| e.at_primitive(mesh, primitive))?;
+            } else if bytes + own > most {
+                break;
+            }
+            bytes += own;
+            count += 1;
+        }
+        Ok(count)
+    }
+}
+
+impl Read {
+    fn into_stored(self, job: &Job) -> StoredBody {
+        let body = match self.content {
+            Content::Body(body) => body.map(|body| (body.mesh, body.source.triangles)),
+            // Only what rests is stored.
+            Content::Soft { .. } => None,
+        };
+        StoredBody {
+            name: (job.mesh, job.primitive),
+            odd_indices: self.odd_indices,
+            degenerate: self.degenerate.map(|d| (d.count, d.triangles)),
+            body,
+        }
+    }
+
+    fn of_stored(stored: StoredBody) -> Self {
+        let StoredBody { name: (mesh, primitive), odd_indices, degenerate, body } = stored;
+        let degenerate = degenerate.map(|(count, triangles)| DegenerateTriangles {
+            mesh,
+            primitive,
+            count,
+            triangles,
+        });
+        let body = body.map(|(triangles, numbers)| Body {
+            mesh: triangles,
+            source: MeshSource { mesh, primitive, triangles: numbers },
+        });
+        Self { content: Content::Body(body), degenerate, odd_indices }
+    }
 }
 
 fn linear_part(columns: [u64; 9]) -> DMat3 {
@@ -971,7 +1097,8 @@ fn renumber_vertices(mesh: &mut Mesh) {
     const UNUSED: u32 = u32::MAX;
     let mut new_number = vec![UNUSED; mesh.positions.len()];
     let mut used = Vec::new();
-    for v in mesh.triangles.as_flattened_mut() {
+    let mut triangles = std::mem::take(&mut mesh.triangles).into_vec();
+    for v in triangles.as_flattened_mut() {
         let number = &mut new_number[*v as usize];
         if *number == UNUSED {
             *number = used.len() as u32;
@@ -979,10 +1106,13 @@ fn renumber_vertices(mesh: &mut Mesh) {
         }
         *v = *number;
     }
+    mesh.triangles = triangles.into();
     drop(new_number);
-    let choose = |positions: &mut Vec<[f32; 3]>| {
-        *positions = used.iter().map(|&v| positions[v as usize]).collect();
+    let chosen = |positions: &[[f32; 3]]| -> Vec<[f32; 3]> {
+        used.iter().map(|&v| positions[v as usize]).collect()
     };
-    choose(&mut mesh.positions);
-    mesh.motion.iter_mut().flat_map(|m| &mut m.keys).for_each(choose);
+    mesh.positions = chosen(&mesh.positions).into();
+    for positions in mesh.motion.iter_mut().flat_map(|m| &mut m.keys) {
+        *positions = chosen(positions);
+    }
 }

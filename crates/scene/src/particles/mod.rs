@@ -466,6 +466,7 @@ fn scene(path: &Path, source: &Source, options: &OpenOptions) -> Result<Scene, S
         key_times,
         report,
         digest,
+        memory: None,
     })
 }
 

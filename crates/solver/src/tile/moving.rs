@@ -146,6 +146,7 @@ impl TileSolver {
             }
             self.moving.changed = false;
             self.seen_through.clear();
+            geometry.look();
             let walk = Walk { context, motion, state, end, pass: Pass::Occluders };
             self.walk_moving(&walk);
             if self.moving.changed && !geometry.see_through.instances.is_empty() {

@@ -69,6 +69,7 @@ impl TileSolver {
         if !settled.movers {
             return false;
         }
+        context.geometry.look();
         self.aim(context, w, c);
         let mut left = MOST_NODES;
         [&context.geometry.occluders, &context.geometry.see_through]

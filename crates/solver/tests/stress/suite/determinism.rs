@@ -23,7 +23,7 @@ pub fn shuffled(case: &Case, random: &mut Random) -> Shuffled {
         let mut mixed: Vec<u32> = (0..mesh.triangles.len() as u32).collect();
         random.shuffle(&mut mixed);
         let triangles: Vec<[u32; 3]> = mixed.iter().map(|&t| mesh.triangles[t as usize]).collect();
-        let (mesh, order) = Mesh::new(mesh.positions.clone(), &triangles);
+        let (mesh, order) = Mesh::new(mesh.positions.to_vec(), &triangles);
         meshes.push(mesh);
         orders.push(order.iter().map(|&t| mixed[t as usize]).collect());
     }

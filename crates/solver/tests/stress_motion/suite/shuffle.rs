@@ -15,7 +15,7 @@ pub fn shuffled(case: &MovingCase, random: &mut Random) -> (MovingCase, Vec<u32>
         random.shuffle(&mut mixed);
         let triangles: Vec<[u32; 3]> = mixed.iter().map(|&t| mesh.triangles[t as usize]).collect();
         let (mesh, order) = match &mesh.motion {
-            None => Mesh::new(mesh.positions.clone(), &triangles),
+            None => Mesh::new(mesh.positions.to_vec(), &triangles),
             Some(motion) => Mesh::moving(motion.keys.clone(), &triangles),
         };
         meshes.push(mesh);
