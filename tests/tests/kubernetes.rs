@@ -758,7 +758,7 @@ fn the_image_is_small_unprivileged_and_built_from_the_lock_file() {
     assert!(stages[1].contains("distroless"), "{}", stages[1]);
     let last = lines.iter().rposition(|line| line.starts_with("FROM ")).expect("a stage");
     let runs = &lines[last..];
-    assert!(runs.iter().any(|line| *line == "USER 65532:65532"), "runAsNonRoot wants a number");
+    assert!(runs.contains(&"USER 65532:65532"), "runAsNonRoot wants a number");
     assert!(!runs.iter().any(|line| line.starts_with("RUN ")), "there is no shell");
     assert!(
         runs.iter()

@@ -13,7 +13,7 @@ use sightline_coordinator::{
 };
 use sightline_jobs::{BakeConfig, BakeStatus, Done, Phase, Plan};
 use sightline_scene::{Keeper, SceneDigest};
-use sightline_store::{BakeStore, Dataset};
+use sightline_store::{BakeStore, Dataset, StoreError, keys};
 use sightline_worker::{Worker, WorkerOptions};
 use tokio::sync::oneshot;
 
@@ -109,11 +109,21 @@ fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 
+/// A place that was given for output is no missing input.
+fn unusable(error: StoreError) -> Failure {
+    match error {
+        StoreError::BadLocation { .. } => {
+            Failure::new(Kind::Store, error.to_string()).with_help("give another place with --out")
+        }
+        other => other.into(),
+    }
+}
+
 /// Opens the output folder, and says what a new bake into it has to do with the last one.
 pub async fn open_store(input: &BakeInput, digest: &SceneDigest, plan: &Plan) -> Result<BakeStore> {
-    let store = BakeStore::open_or_create(&input.out).map_err(|error| {
-        Failure::new(Kind::Store, error.to_string()).with_help("give another place with --out")
-    })?;
+    let store = BakeStore::open_or_create(&input.out).map_err(unusable)?;
+    // The first request shows whether there is such a bucket, and whether it lets us in.
+    store.get_if_exists(keys::POINTER).await.map_err(unusable)?;
     match since_last_bake(&store, digest, &plan.config).await? {
         Before::Nothing => {}
         Before::Same => {

@@ -41,7 +41,10 @@ pub use location::{is_url, key_beside, local_path, redacted};
 /// How often a put is made whose refusal names an object that is not there: S3 answers so while
 /// another conditional put of the key is under way.
 const CONFLICT_TRIES: u32 = 8;
-/// The first pause between those; each is twice as long as the one before, 6 s together.
+/// How often a deletion is asked for.
+const DELETE_TRIES: u32 = 3;
+/// The first pause between those of [`CONFLICT_TRIES`]; each is twice as long as the one before, 6 s
+/// together.
 const CONFLICT_PAUSE: Duration = Duration::from_millis(50);
 
 /// Who made an object exist.
@@ -305,10 +308,16 @@ impl BakeStore {
     }
 
     async fn delete(&self, key: &str) -> Result<()> {
-        match self.objects.delete(&self.path(key)?).await {
-            Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
-            Err(error) => Err(self.error(key, error)),
+        let path = self.path(key)?;
+        let mut outcome = Ok(());
+        // The client does not send a deletion again whose answer was lost; doing so is safe.
+        for _ in 0..DELETE_TRIES {
+            outcome = match self.objects.delete(&path).await {
+                Ok(()) | Err(object_store::Error::NotFound { .. }) => return Ok(()),
+                Err(error) => Err(self.error(key, error)),
+            };
         }
+        outcome
     }
 
     fn path(&self, key: &str) -> Result<Path> {
