@@ -11,6 +11,8 @@
 //! knows without paying for it at every step; but a chunk that is in use comes back from the page cache of the
 //! system in some tens of microseconds, and the page cache, which sees the use, is the cache here.
 //!
+//! A thread looks every few milliseconds besides, for what reads arrays and does not walk.
+//!
 //! How many chunks are loaded is read from `/proc/self/pagemap` before they are given back, and at the
 //! end. Linux only.
 
@@ -22,6 +24,7 @@ use std::{
         Arc, Mutex, MutexGuard, PoisonError, Weak,
         atomic::{AtomicI64, AtomicU64, Ordering},
     },
+    time::Duration,
 };
 
 use sightline_geometry::{Residency, STEPS};
@@ -61,6 +64,7 @@ pub struct Held {
 #[derive(Debug)]
 struct Kept {
     map: Weak<Map>,
+    bytes: u64,
     /// Whether it is a chunk file: others are not counted.
     counts: bool,
     touched: Vec<bool>,
@@ -108,6 +112,22 @@ impl Keeper {
         Ok(keeper)
     }
 
+    /// Looks every few milliseconds on a thread of its own, until the keeper is dropped: what reads
+    /// mapped arrays without knowing of it, such as the writer of the numbering, is kept within the limit too.
+    pub(crate) fn watch(self: &Arc<Self>) -> io::Result<()> {
+        /// Far less than it takes to load an eighth of any limit from a disk.
+        const PAUSE: Duration = Duration::from_millis(5);
+        let keeper = Arc::downgrade(self);
+        let look = move || {
+            while let Some(keeper) = keeper.upgrade() {
+                keeper.look_now();
+                drop(keeper);
+                std::thread::park_timeout(PAUSE);
+            }
+        };
+        std::thread::Builder::new().name("memory".into()).spawn(look).map(drop)
+    }
+
     /// The limit, bytes.
     #[must_use]
     pub const fn limit(&self) -> u64 {
@@ -118,7 +138,8 @@ impl Keeper {
     /// `counts` in what is reported.
     pub(crate) fn keep(&self, map: &Arc<Map>, counts: bool) {
         let touched = vec![false; map.len().div_ceil(CHUNK)];
-        let kept = Kept { map: Arc::downgrade(map), counts, touched, given_back: 0 };
+        let (map, bytes) = (Arc::downgrade(map), map.len() as u64);
+        let kept = Kept { map, bytes, counts, touched, given_back: 0 };
         let mut circle = self.circle();
         circle.kept.retain(|kept| kept.counts || kept.map.strong_count() > 0);
         circle.kept.push(kept);
@@ -142,7 +163,6 @@ impl Keeper {
         };
         for kept in circle.kept.iter_mut().filter(|kept| kept.counts) {
             if let Some(map) = kept.map.upgrade() {
-                held.bytes += map.len() as u64;
                 for chunk in 0..kept.touched.len() {
                     if self.loaded_pages(&map, chunk).is_some_and(|pages| pages > 0) {
                         kept.touched[chunk] = true;
@@ -150,6 +170,7 @@ impl Keeper {
                     }
                 }
             }
+            held.bytes += kept.bytes;
             held.chunks += kept.touched.len() as u64;
             held.touched += kept.touched.iter().filter(|&&t| t).count() as u64;
             held.given_back += kept.given_back;
@@ -354,7 +375,12 @@ mod tests {
         assert_eq!(keeper.held().given_back, 1);
         drop(map);
         keeper.look_now();
-        assert_eq!(keeper.held().chunks, 1, "what was held is still told");
+        let held = keeper.held();
+        assert_eq!(
+            (held.chunks, held.bytes),
+            (1, CHUNK as u64 - 100),
+            "what was held is still told"
+        );
     }
 
     #[test]

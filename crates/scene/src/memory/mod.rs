@@ -122,5 +122,7 @@ pub(crate) fn hash_file(path: &std::path::Path) -> io::Result<(u64, blake3::Hash
 pub(crate) fn keeper(limit: Option<&MemoryLimit>) -> Result<Option<Arc<Keeper>>, SceneError> {
     let Some(limit) = limit else { return Ok(None) };
     let keeper = Keeper::new(limit).map_err(|source| Cause::MemoryUnknown { source })?;
-    Ok(Some(Arc::new(keeper)))
+    let keeper = Arc::new(keeper);
+    keeper.watch().map_err(|source| Cause::MemoryUnknown { source })?;
+    Ok(Some(keeper))
 }
