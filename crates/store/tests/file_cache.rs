@@ -60,7 +60,7 @@ async fn the_next_source_is_asked_when_one_has_something_else() {
     let missing = (store.clone(), "files/nothing".to_owned());
     let wrong = cache.by_content(digest, 1000, &[missing.clone(), source(0)]).await.unwrap_err();
     assert!(matches!(wrong, StoreError::Corrupt { .. }), "{wrong}");
-    let none = cache.by_content(digest, 1000, &[missing.clone()]).await.unwrap_err();
+    let none = cache.by_content(digest, 1000, std::slice::from_ref(&missing)).await.unwrap_err();
     assert!(matches!(none, StoreError::NotFound { .. }), "{none}");
     assert_eq!((count(folder.path(), "files"), count(folder.path(), "partial")), (0, 0));
     let file = cache.by_content(digest, 1000, &[missing, source(0), source(2)]).await.unwrap();
