@@ -3,6 +3,16 @@
 //! Nothing that matters is held in memory alone, and nothing is changed once it is written: every
 //! object below is created only if absent. So there is no moment at which a crash leaves a mess.
 //!
+//! Invariants, besides those of `sightline_jobs` (JB, SC); the simulation in `tests` checks them behind
+//! every step of its clock:
+//! - CL-1: no object of a bake is replaced or deleted, but for the pointer and the probe's scratch.
+//! - CL-2: epochs have no gaps, and one owner each.
+//! - CL-3: a commit is created after the parts that it names, and they hold the bytes it says.
+//! - CL-4: messages decide nothing. A lost, repeated, late or forged one costs time at most: a task is
+//!   done when its commit exists, and a coordinator is replaced when a newer epoch exists.
+//! - CL-5: a write whose answer was lost is settled by reading it back; bytes that are there count as
+//!   written, whoever is told that they were there before.
+//!
 //! | object | written by | meaning |
 //! | --- | --- | --- |
 //! | `bake/<bake>/plan.bin` | the first coordinator | what the numbers of tasks mean |
@@ -32,6 +42,23 @@
 //!
 //! An attempt whose commit was created by another changes and deletes nothing, and reports the
 //! task as committed: it is.
+//!
+//! What can go wrong, and what it costs:
+//!
+//! | what | what happens | cost |
+//! | --- | --- | --- |
+//! | a worker dies | its lease runs out, the task is leased again | the attempt |
+//! | a worker is asked to stop | it ends the task at hand within its drain time, or gives the lease back | at most the attempt |
+//! | a worker stops for ten minutes and wakes | its lease is lost; should it still commit, the commit is there or is the first: the same bytes (CL-3) | nothing |
+//! | a worker is slow | an idle one gets a second attempt (SC-1); one commit wins, the other is told at its next heartbeat | an attempt |
+//! | a worker fails everything | its tasks go elsewhere, it pauses longer and longer | little |
+//! | the coordinator dies | workers look for it with growing pauses; the next one lists commits and goes on | what was not committed |
+//! | the coordinator stops for a while | another takes the next epoch; the old one finds it in the store and ends. Until then both lease tasks, which is safe | double work |
+//! | the network parts them | calls fail, connections end by their keepalive, workers register again | time |
+//! | the store does not answer | attempts are retried later, with growing pauses that differ by task; the coordinator waits it out | time |
+//! | the store answers too late | the write is read back (CL-5), or arrives after all and finds the object there | nothing |
+//! | the store breaks create-if-absent | the probe at the start finds out, and the bake is refused | the bake |
+//! | a task cannot succeed | it is quarantined with its reason, the rest of the bake goes on, nothing is published (JB-2) | the dataset |
 //!
 //! When all tasks are committed the coordinator writes the dataset. Its files are named by content
 //! and the manifest is found again (see `sightline_store::publish`), so a crash leaves files that

@@ -30,17 +30,20 @@ pub fn sightline<A: AsRef<std::ffi::OsStr>>(arguments: impl IntoIterator<Item = 
     command
 }
 
-/// Asks for all executables of the workspace, so that features are unified as in a full build and
-/// no dependency is built twice.
+/// Asks for all executables and tests of the workspace, so that features are unified as when the tests
+/// were built and no dependency is built twice.
 fn build() -> BTreeMap<String, PathBuf> {
     let mut cargo = Command::new(env!("CARGO"));
-    cargo.args(["build", "--workspace", "--bins", "--message-format=json"]);
+    cargo.args(["build", "--workspace", "--bins", "--tests", "--message-format=json"]);
     if !cfg!(debug_assertions) {
         cargo.arg("--release");
     }
     let messages = workspace::run(cargo.current_dir(workspace::root()));
     let executable = |line: &str| {
         let message: Value = serde_json::from_str(line).ok()?;
+        if message["profile"]["test"] == true {
+            return None;
+        }
         let path = PathBuf::from(message["executable"].as_str()?);
         Some((message["target"]["name"].as_str()?.to_owned(), path))
     };

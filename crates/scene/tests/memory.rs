@@ -148,9 +148,11 @@ fn a_damaged_chunk_file_is_made_again_and_said_so() {
     drop(whole);
     std::fs::write(&file, &bytes).unwrap();
     let scene = Scene::open(&path, &tiny(&chunks)).unwrap();
-    let said = scene.report.warnings.iter().any(|w| w.contains(&file.display().to_string()));
-    assert!(said, "{:?}", scene.report.warnings);
-    assert!(Scene::open(&path, &tiny(&chunks)).unwrap().report.warnings.is_empty());
+    let says = |scene: &Scene| {
+        scene.report.warnings.iter().any(|w| w.contains(&file.display().to_string()))
+    };
+    assert!(says(&scene), "{:?}", scene.report.warnings);
+    assert!(!says(&Scene::open(&path, &tiny(&chunks)).unwrap()));
 }
 
 #[test]
@@ -183,7 +185,8 @@ fn the_golden_chunk_file_is_made_and_read() {
     let copy = found.path().join(stored.file_name().unwrap());
     std::fs::copy(&stored, &copy).unwrap();
     let read = Scene::open(&scene, &tiny(found.path())).unwrap();
-    assert!(read.report.warnings.is_empty(), "it was read, not made: {:?}", read.report.warnings);
+    let made_again = read.report.warnings.iter().any(|w| w.contains(&copy.display().to_string()));
+    assert!(!made_again, "it was read, not made: {:?}", read.report.warnings);
     assert_same(&read, &Scene::open(&scene, &OpenOptions::default()).unwrap());
 }
 

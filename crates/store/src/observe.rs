@@ -161,9 +161,9 @@ mod tests {
         assert!(store.get_if_exists("b").await.unwrap().is_none());
         assert_eq!(store.list("").await.unwrap().len(), 1);
         let told = told.lock().unwrap();
-        assert_eq!(
-            told[..],
-            [("put", "ok"), ("put", "already_exists"), ("get", "not_found"), ("list", "ok")]
-        );
+        // Who finds an object there looks whether it is its own.
+        let found = [("put", "already_exists"), ("get", "ok")];
+        let others = [("get", "not_found"), ("list", "ok")];
+        assert_eq!(told[..], [&[("put", "ok")][..], &found, &others].concat());
     }
 }
