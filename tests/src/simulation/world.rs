@@ -253,7 +253,7 @@ impl<'a> Simulation<'a> {
             let (plan, publisher) = (plan.clone(), publisher.clone());
             sim.host(name(host), move || {
                 let mut options = CoordinatorOptions::new(
-                    SocketAddr::from(([0, 0, 0, 0], PORT)),
+                    SocketAddr::from(([127, 0, 0, 1], PORT)),
                     store.clone(),
                     plan.clone(),
                     Arc::new(publisher.clone()),
