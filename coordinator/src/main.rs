@@ -6,17 +6,17 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bytesize::ByteSize;
 use clap::Parser;
 use sightline_coordinator::health::Health;
 use sightline_coordinator::{
-    Coordinator, CoordinatorOptions, Prepared, SecurityFlags, ShareScene, Summary, fetch_scene,
+    Coordinator, CoordinatorOptions, Prepared, SecurityFlags, ShareScene, fetch_scene,
     prepare_from, share_scene,
 };
 use sightline_jobs::BakeConfig;
-use sightline_store::{BakeStore, ByteSize, FileCache, local_path};
+use sightline_store::{BakeStore, FileCache, local_path};
 use sightline_telemetry::metrics::{Listener, Registry};
-use sightline_telemetry::stop::signalled;
-use sightline_telemetry::{LogOptions, Telemetry, WatchFlags};
+use sightline_telemetry::{LogOptions, WatchFlags, stop};
 
 /// Plans a bake, leases its tasks to workers, publishes the dataset.
 #[derive(Debug, Parser)]
@@ -68,33 +68,10 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let format = arguments.watch.log_format;
     let logs = LogOptions { format, filter: "info", service: "sightline-coordinator" };
-    let telemetry = Telemetry::to_stderr(logs);
-    let runtime = tokio::runtime::Runtime::new().map_err(Error::from);
-    let ended = match (&telemetry, runtime) {
-        (Err(error), _) => Err(error.to_string().into()),
-        (_, Err(error)) => Err(error),
-        (Ok(_), Ok(runtime)) => runtime.block_on(run(arguments)),
-    };
-    match ended {
-        Ok(summary) => {
-            tracing::info!(
-                manifest = summary.manifest,
-                changed = summary.changed,
-                cells = summary.status.dataset_cells(),
-                solve_ms = summary.status.solve_ms,
-                merge_ms = summary.status.merge_ms,
-                "done"
-            );
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            tracing::error!("{error}");
-            ExitCode::FAILURE
-        }
-    }
+    stop::run(logs, run(arguments))
 }
 
-async fn run(arguments: Arguments) -> Result<Summary, Error> {
+async fn run(arguments: Arguments) -> Result<(), Error> {
     let text = std::fs::read_to_string(&arguments.config)
         .map_err(|error| format!("{}: {error}", arguments.config.display()))?;
     let overrides = arguments
@@ -145,7 +122,16 @@ async fn run(arguments: Arguments) -> Result<Summary, Error> {
     let ended = async { status.wait_for(|s| s.phase.is_final()).await.map(drop) };
     tokio::select! {
         _ = ended => {}
-        () = signalled() => coordinator.shutdown(),
+        () = stop::signalled() => coordinator.shutdown(),
     }
-    Ok(coordinator.join().await?)
+    let summary = coordinator.join().await?;
+    tracing::info!(
+        manifest = summary.manifest,
+        changed = summary.changed,
+        cells = summary.status.dataset_cells(),
+        solve_ms = summary.status.solve_ms,
+        merge_ms = summary.status.merge_ms,
+        "done"
+    );
+    Ok(())
 }

@@ -14,7 +14,10 @@ use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use sightline_jobs::{BakeStatus, FailureClass, Phase, TaskKind};
-use sightline_telemetry::metrics::{Label, Labels, Registry, StoreMetrics, duration_buckets};
+use sightline_store::Operation;
+use sightline_telemetry::metrics::{
+    Label, Labels, Registry, StoreMetrics, begin, duration_buckets,
+};
 use tonic::Code;
 use tonic::body::Body;
 use tower::{Layer, Service};
@@ -49,7 +52,7 @@ pub struct Metrics {
 
 impl Default for Metrics {
     fn default() -> Self {
-        Self {
+        let metrics = Self {
             tasks: Family::default(),
             tasks_planned: Count::default(),
             units_planned: Family::default(),
@@ -68,8 +71,15 @@ impl Default for Metrics {
             durations: Family::new_with_constructor(duration_buckets),
             rpcs: Family::default(),
             refusals: Counter::default(),
-            store: StoreMetrics::default(),
+            store: StoreMetrics::new(&Operation::KINDS, &Operation::RESULTS),
+        };
+        metrics.show(&BakeStatus::default());
+        begin(&metrics.failures, "class", FailureClass::ALL.map(FailureClass::name));
+        begin(&metrics.durations, "kind", TaskKind::NAMES);
+        for method in METHODS {
+            drop(metrics.rpcs.get_or_create(&[("method", method), ("code", name_of(Code::Ok))]));
         }
+        metrics
     }
 }
 
@@ -190,10 +200,12 @@ impl Metrics {
     }
 }
 
+/// The methods of the protocol.
+const METHODS: [&str; 7] =
+    ["Register", "Lease", "Heartbeat", "Report", "Goodbye", "GetStatus", "WatchStatus"];
+
 /// The method that a path names, if it is one of the protocol.
 fn method_of(path: &str) -> &'static str {
-    const METHODS: [&str; 7] =
-        ["Register", "Lease", "Heartbeat", "Report", "Goodbye", "GetStatus", "WatchStatus"];
     let of_ours = path.strip_prefix("/sightline.v1.Coordinator/");
     match of_ours.and_then(|name| METHODS.into_iter().find(|method| *method == name)) {
         Some(method) => method,

@@ -1,6 +1,7 @@
 //! What a running coordinator knows: the scheduler, its workers, and the status made from them.
 
-use std::collections::BTreeMap;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
 
 use sightline_jobs::{
     BakeStatus, FailureClass, Lease, LeaseId, LeaseStatus, Outcome, Phase, Plan, QuarantinedTask,
@@ -58,7 +59,7 @@ pub(crate) struct State {
     is_epoch_in_doubt: bool,
     /// Certificates of those who registered with one.
     owners: BTreeMap<WorkerId, blake3::Hash>,
-    attempted_again: BTreeMap<TaskId, u32>,
+    attempted_again: BTreeSet<(Reverse<u32>, TaskId)>,
 }
 
 impl State {
@@ -84,7 +85,7 @@ impl State {
             newer_epoch: None,
             is_epoch_in_doubt: false,
             owners: BTreeMap::new(),
-            attempted_again: BTreeMap::new(),
+            attempted_again: BTreeSet::new(),
         }
     }
 
@@ -204,7 +205,8 @@ impl State {
         let solves = self.phase == Phase::Solving;
         let lease = solves.then(|| self.scheduler.lease(worker, now_ms)).flatten()?;
         if lease.attempt > 1 {
-            self.attempted_again.insert(lease.task, lease.attempt);
+            self.attempted_again.remove(&(Reverse(lease.attempt - 1), lease.task));
+            self.attempted_again.insert((Reverse(lease.attempt), lease.task));
         }
         Some(lease)
     }
@@ -273,7 +275,6 @@ impl State {
     }
 
     pub fn status(&self, now_ms: u64) -> BakeStatus {
-        let missing = self.scheduler.missing();
         let in_phase = |phase| {
             if self.phase == phase { now_ms.saturating_sub(self.phase_since_ms) } else { 0 }
         };
@@ -295,13 +296,13 @@ impl State {
             leases_in_force: u32::try_from(self.scheduler.leases().count()).unwrap_or(u32::MAX),
             attempts: self.task_attempts(),
             tasks_attempted_again: u32::try_from(self.attempted_again.len()).unwrap_or(u32::MAX),
-            quarantined: missing
-                .quarantined
-                .into_iter()
+            quarantined: self
+                .scheduler
+                .quarantined()
                 .take(BakeStatus::LISTED_MAX)
                 .map(|(task, reason)| QuarantinedTask { task, reason })
                 .collect(),
-            tasks_blocked: u32::try_from(missing.blocked.len()).unwrap_or(u32::MAX),
+            tasks_blocked: u32::try_from(self.scheduler.blocked().len()).unwrap_or(u32::MAX),
             elapsed_ms: now_ms.saturating_sub(self.started_ms),
             solve_ms,
             merge_ms: self.merge_ms + in_phase(Phase::Merging),
@@ -346,20 +347,15 @@ impl State {
                 worker_name: self.name_of(lease.worker).to_owned(),
                 attempt: lease.attempt,
                 age_ms: now_ms.saturating_sub(lease.since_ms),
-                usual_ms: self.scheduler.predicted_ms(lease.task).unwrap_or(0),
+                predicted_ms: self.scheduler.predicted_ms(lease.task).unwrap_or(0),
+                is_overdue: self.scheduler.is_overdue(lease, now_ms),
             })
             .collect()
     }
 
     /// Tasks with more than one attempt, the most attempted first.
     fn task_attempts(&self) -> Vec<TaskAttempts> {
-        let mut attempts: Vec<TaskAttempts> = self
-            .attempted_again
-            .iter()
-            .map(|(task, attempts)| TaskAttempts { task: *task, attempts: *attempts })
-            .collect();
-        attempts.sort_by_key(|a| (std::cmp::Reverse(a.attempts), a.task));
-        attempts.truncate(BakeStatus::LISTED_MAX);
-        attempts
+        let most = self.attempted_again.iter().take(BakeStatus::LISTED_MAX);
+        most.map(|&(Reverse(attempts), task)| TaskAttempts { task, attempts }).collect()
     }
 }

@@ -350,7 +350,8 @@ impl From<&BakeStatus> for v1::Status {
             worker_name: l.worker_name.clone(),
             attempt: l.attempt,
             age_ms: l.age_ms,
-            usual_ms: l.usual_ms,
+            predicted_ms: l.predicted_ms,
+            is_overdue: l.is_overdue,
         };
         let attempts = |a: &TaskAttempts| v1::TaskAttempts { task: a.task.0, attempts: a.attempts };
         Self {
@@ -401,7 +402,8 @@ impl TryFrom<v1::Status> for BakeStatus {
             worker_name: l.worker_name,
             attempt: l.attempt,
             age_ms: l.age_ms,
-            usual_ms: l.usual_ms,
+            predicted_ms: l.predicted_ms,
+            is_overdue: l.is_overdue,
         };
         let attempts =
             |a: v1::TaskAttempts| TaskAttempts { task: TaskId(a.task), attempts: a.attempts };
@@ -556,7 +558,8 @@ mod tests {
                 worker_name: "w".into(),
                 attempt: 3,
                 age_ms: 5,
-                usual_ms: 6,
+                predicted_ms: 6,
+                is_overdue: true,
             }],
             leases_in_force: 301,
             attempts: vec![TaskAttempts { task: TaskId(2), attempts: 3 }],

@@ -61,6 +61,17 @@ impl City {
         let summary = ended.json();
         Self { folder: folder.to_owned(), scene, dataset, summary }
     }
+
+    /// An empty folder of one test, beside the city.
+    ///
+    /// # Panics
+    /// When a test has taken the name already.
+    #[must_use]
+    pub fn empty(&self, name: &str) -> PathBuf {
+        let folder = self.folder.join(name);
+        std::fs::create_dir(&folder).expect("a folder can be made once");
+        folder
+    }
 }
 
 /// Generates a small city.

@@ -21,7 +21,6 @@
 //! | security context, resources, probes, network policies | left out |
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::net::{Ipv4Addr, TcpListener};
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -36,15 +35,11 @@ use crate::binaries::{executable, sightline};
 use crate::job::{JobState, PodEnd, PodId, Verdict};
 use crate::manifests::Manifests;
 use crate::process::{self, Ended, Process, eventually};
+use crate::servers::free_port;
 
 /// Flags that secure connections, each with one value but the last.
 pub const SECURITY: [&str; 6] =
     ["--tls-cert", "--tls-key", "--tls-ca", "--tls-client-ca", "--token-file", "--insecure"];
-/// Flags with one value that manifests use and that a build may not know yet. They are left out
-/// where it does not.
-pub const TO_COME: [&str; 6] =
-    ["--metrics", "--cache", "--cache-size", "--memory", "--drain-seconds", "--name"];
-
 /// A cluster of one machine.
 pub struct Cluster {
     folder: PathBuf,
@@ -372,7 +367,7 @@ impl PodContext<'_> {
         let mut command = Command::new(executable(name));
         // The environment of a pod is that of its manifest.
         command.env_clear().envs(&environment).current_dir(self.folder);
-        command.args(known(arguments).iter().map(|word| self.mapped(word, &volumes)));
+        command.args(unsecured(arguments).iter().map(|word| self.mapped(word, &volumes)));
         command
     }
 
@@ -453,22 +448,18 @@ fn expand(word: &str, environment: &BTreeMap<String, String>) -> String {
     word
 }
 
-/// The arguments without those of [`SECURITY`], and without those of [`TO_COME`] that the command
-/// does not know.
-fn known(arguments: &[String]) -> Vec<String> {
-    let help = help_of(&arguments[0]);
-    let is_known = |flag: &str| help.split_whitespace().any(|word| word == flag);
+/// The arguments without those of [`SECURITY`].
+fn unsecured(arguments: &[String]) -> Vec<String> {
     let mut kept = Vec::new();
     let mut words = arguments.iter();
     while let Some(word) = words.next() {
-        let flag = word.as_str();
-        if SECURITY.contains(&flag) || (TO_COME.contains(&flag) && !is_known(flag)) {
-            if flag != "--insecure" {
+        match word.as_str() {
+            "--insecure" => {}
+            flag if SECURITY.contains(&flag) => {
                 words.next();
             }
-            continue;
+            _ => kept.push(word.clone()),
         }
-        kept.push(word.clone());
     }
     kept
 }
@@ -480,10 +471,4 @@ fn known(arguments: &[String]) -> Vec<String> {
 #[must_use]
 pub fn help_of(command: &str) -> String {
     process::run(&mut sightline([command, "--help"]), crate::city::LIMIT).success().stdout
-}
-
-/// A port of this machine that nobody listens on.
-fn free_port() -> u16 {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a port is free");
-    listener.local_addr().expect("it has an address").port()
 }

@@ -1,9 +1,9 @@
 //! What Sightline promises to who runs it, kept by the real commands on a small city.
 
-use std::net::{Ipv4Addr, TcpListener};
+use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::OnceLock;
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use serde_json::Value;
@@ -14,6 +14,7 @@ use sightline_store::{BakeStore, CellEntry, Dataset};
 use sightline_tests::binaries::{executable, sightline};
 use sightline_tests::city::{self, CELLS, City, LIMIT, TASK_UNITS};
 use sightline_tests::process::{self, Process, eventually};
+use sightline_tests::servers::free_port;
 use sightline_tests::{dataset, requirement};
 use tonic::transport::Endpoint;
 use tonic_health::pb::HealthCheckRequest;
@@ -32,22 +33,9 @@ const WORST_MAX: f64 = 0.005;
 /// A memory limit below what the command itself takes, and above what of the city stays in memory.
 const LITTLE: &str = "--memory=32MiB";
 
-fn folder() -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).join("end_to_end")
-}
-
 /// The city that all tests share, baked once.
-fn baked() -> &'static City {
-    static CITY: OnceLock<City> = OnceLock::new();
-    CITY.get_or_init(|| City::bake(&folder()))
-}
-
-/// An empty folder of one test.
-fn empty(name: &str) -> PathBuf {
-    let folder = baked().folder.join(name);
-    std::fs::create_dir(&folder).expect("a folder can be made once");
-    folder
-}
+static CITY: LazyLock<City> =
+    LazyLock::new(|| City::bake(&Path::new(env!("CARGO_TARGET_TMPDIR")).join("end_to_end")));
 
 fn run(command: &mut Command) -> process::Ended {
     process::run(command, LIMIT)
@@ -57,12 +45,6 @@ fn number(value: &Value) -> f64 {
     value.as_f64().unwrap_or_else(|| panic!("{value} is a number"))
 }
 
-/// A port of this machine that nobody listens on.
-fn free_port() -> u16 {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a port is free");
-    listener.local_addr().expect("it has an address").port()
-}
-
 fn is_listening(port: u16) -> bool {
     std::net::TcpStream::connect((Ipv4Addr::LOCALHOST, port)).is_ok()
 }
@@ -70,7 +52,7 @@ fn is_listening(port: u16) -> bool {
 /// `sightline coordinator`. Its tasks are cut otherwise than those of the shared bake: the dataset
 /// must not depend on it.
 fn coordinator(dataset: &Path, listen: &str) -> Command {
-    let arguments = city::bake_arguments("coordinator", &baked().scene, dataset, [3, 1]);
+    let arguments = city::bake_arguments("coordinator", &CITY.scene, dataset, [3, 1]);
     let mut command = sightline(arguments);
     command.args(["--listen", listen]);
     command
@@ -87,7 +69,7 @@ struct Cluster {
 impl Cluster {
     /// Starts a coordinator; `command` listens on the port that it is given.
     fn start(name: &str, command: impl FnOnce(&Path, &str) -> Command) -> Self {
-        let folder = empty(name);
+        let folder = CITY.empty(name);
         let dataset = folder.join("dataset");
         let port = free_port();
         let mut command = command(&dataset, &format!("127.0.0.1:{port}"));
@@ -113,7 +95,7 @@ impl Cluster {
 
 #[test]
 fn bake_says_what_it_did() {
-    let city = baked();
+    let city = &*CITY;
     let cells = number(&city.summary["cells"]);
     assert_eq!(cells, entries(city).len() as f64, "{:#}", city.summary);
     assert_eq!(cells, f64::from(CELLS), "the street is free, so no cell is skipped");
@@ -121,10 +103,10 @@ fn bake_says_what_it_did() {
 
 #[test]
 fn the_same_command_gives_the_same_bytes_with_one_thread() {
-    let out = empty("again");
-    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out, TASK_UNITS));
+    let out = CITY.empty("again");
+    let mut command = sightline(city::bake_arguments("bake", &CITY.scene, &out, TASK_UNITS));
     let _ = run(command.args(["--threads=1", "--json"])).success();
-    dataset::assert_same(&baked().dataset, &out);
+    dataset::assert_same(&CITY.dataset, &out);
 }
 
 #[test]
@@ -140,7 +122,7 @@ fn cluster_with_a_killed_worker_writes_the_bytes_of_bake() {
     for worker in others {
         let _ = worker.wait(LIMIT).success();
     }
-    dataset::assert_same(&baked().dataset, &cluster.dataset);
+    dataset::assert_same(&CITY.dataset, &cluster.dataset);
 }
 
 #[test]
@@ -156,22 +138,22 @@ fn a_worker_that_joins_late_helps_and_one_that_leaves_is_not_missed() {
     let _ = cluster.coordinator.wait(LIMIT).success();
     let late = late.wait(LIMIT).success();
     assert!(late.stdout.contains("given back"), "{}", late.stdout);
-    dataset::assert_same(&baked().dataset, &cluster.dataset);
+    dataset::assert_same(&CITY.dataset, &cluster.dataset);
 }
 
 #[test]
 fn a_bake_in_little_memory_writes_the_same_bytes_and_is_measured_alike() {
-    let out = empty("limited");
+    let out = CITY.empty("limited");
     let chunks = format!("--chunks={}", out.join("chunks").display());
     let dataset = out.join("dataset");
     let limited =
         |command: &mut Command| run(command.args([LITTLE, &chunks, "--json"])).success().json();
-    let scene = &baked().scene;
+    let scene = &CITY.scene;
     let mut command = sightline(city::bake_arguments("bake", scene, &dataset, TASK_UNITS));
     let memory = &limited(&mut command)["memory"];
     let given_back = number(&memory["chunks_given_back"]);
     assert!(given_back > 2.0 * number(&memory["chunks"]), "{memory:#}");
-    dataset::assert_same(&baked().dataset, &dataset);
+    dataset::assert_same(&CITY.dataset, &dataset);
     let verify = || {
         let mut command = sightline(["verify", "--cells=2", "--viewpoints=3", "--rays=5000"]);
         command.arg(&dataset).arg("--scene").arg(scene);
@@ -189,13 +171,13 @@ fn a_bake_in_little_memory_writes_the_same_bytes_and_is_measured_alike() {
 
 #[test]
 fn a_limit_that_a_scene_does_not_fit_is_refused_with_a_reason() {
-    let out = empty("too_little");
+    let out = CITY.empty("too_little");
     let chunks = format!("--chunks={}", out.join("chunks").display());
-    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out, TASK_UNITS));
+    let mut command = sightline(city::bake_arguments("bake", &CITY.scene, &out, TASK_UNITS));
     let ended = run(command.args(["--memory=1MiB", &chunks]));
     assert!(!ended.status.success());
     assert!(ended.stderr.contains("the memory limit is 1 MiB"), "{}", ended.stderr);
-    let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out, TASK_UNITS));
+    let mut command = sightline(city::bake_arguments("bake", &CITY.scene, &out, TASK_UNITS));
     let ended = run(command.args(["--memory=much", &chunks]));
     assert!(ended.stderr.contains("`much` is no size"), "{}", ended.stderr);
 }
@@ -213,12 +195,12 @@ fn a_killed_coordinator_is_replaced_by_another() {
     let _ = successor.wait(LIMIT).success();
     let _ = worker.wait(LIMIT).success();
     assert!(dataset::commits(&dataset) > before);
-    dataset::assert_same(&baked().dataset, &dataset);
+    dataset::assert_same(&CITY.dataset, &dataset);
 }
 
 #[test]
 fn thin_binaries_write_the_bytes_of_bake() {
-    let config = baked().folder.join("bake.toml");
+    let config = CITY.folder.join("bake.toml");
     let text = "\
         [region]\nrectangles = [[-5.0, -10.0, 5.0, 10.0]]\ncell_size = 5.0\n\
         [solver]\nrows = 92\n\
@@ -226,7 +208,7 @@ fn thin_binaries_write_the_bytes_of_bake() {
     std::fs::write(&config, text).expect("the configuration can be written");
     let cluster = Cluster::start("thin", |dataset, listen| {
         let mut command = Command::new(executable("sightline-coordinator"));
-        command.arg(&baked().scene).arg("--out").arg(dataset).arg("--config").arg(&config);
+        command.arg(&CITY.scene).arg("--out").arg(dataset).arg("--config").arg(&config);
         command.args(["--set", "tasks.segments_per_task=5", "--listen", listen]);
         command
     });
@@ -235,15 +217,15 @@ fn thin_binaries_write_the_bytes_of_bake() {
     let worker = Process::start(&mut command, &cluster.folder, "worker");
     let _ = cluster.coordinator.wait(LIMIT).success();
     let _ = worker.wait(LIMIT).success();
-    dataset::assert_same(&baked().dataset, &cluster.dataset);
+    dataset::assert_same(&CITY.dataset, &cluster.dataset);
 }
 
 #[test]
 fn an_interrupted_bake_resumes_to_the_same_bytes() {
-    let folder = empty("interrupted");
+    let folder = CITY.empty("interrupted");
     let out = folder.join("dataset");
     let command = || {
-        let mut command = sightline(city::bake_arguments("bake", &baked().scene, &out, TASK_UNITS));
+        let mut command = sightline(city::bake_arguments("bake", &CITY.scene, &out, TASK_UNITS));
         command.args(["--threads=1", "--json"]);
         command
     };
@@ -257,12 +239,12 @@ fn an_interrupted_bake_resumes_to_the_same_bytes() {
     assert!(before >= 3);
     let _ = run(&mut command()).success();
     assert!(dataset::commits(&out) > before, "the first half was kept");
-    dataset::assert_same(&baked().dataset, &out);
+    dataset::assert_same(&CITY.dataset, &out);
 }
 
 #[test]
 fn a_changed_input_is_named() {
-    let folder = empty("changed");
+    let folder = CITY.empty("changed");
     let (scene, out) = (folder.join("scene.glb"), folder.join("dataset"));
     let one_cell = || {
         let mut command = sightline(["bake"]);
@@ -281,11 +263,11 @@ fn a_changed_input_is_named() {
 
 #[test]
 fn an_unknown_key_is_refused_with_a_suggestion() {
-    let folder = empty("unknown-key");
+    let folder = CITY.empty("unknown-key");
     let config = folder.join("bake.toml");
     std::fs::write(&config, "[solver]\nrow = 100\n").expect("a file can be written");
     let mut command =
-        sightline(city::bake_arguments("bake", &baked().scene, &folder.join("out"), TASK_UNITS));
+        sightline(city::bake_arguments("bake", &CITY.scene, &folder.join("out"), TASK_UNITS));
     let ended = run(command.arg("--config").arg(&config)).failure(2);
     assert!(ended.stderr.contains("solver.row`"), "{}", ended.stderr);
     assert!(ended.stderr.contains("did you mean `solver.rows`"), "{}", ended.stderr);
@@ -296,7 +278,7 @@ fn verify_finds_the_error_small() {
     let found = verify(&[]).success().json();
     let (mean, worst) = (number(&found["error_mean"]), number(&found["error_max"]));
     assert!(mean <= MEAN_MAX && worst <= WORST_MAX, "{found:#}");
-    assert_eq!(number(&found["viewpoints"]), 4.0 * entries(baked()).len() as f64);
+    assert_eq!(number(&found["viewpoints"]), 4.0 * entries(&CITY).len() as f64);
 }
 
 #[test]
@@ -322,12 +304,12 @@ fn the_worst_viewpoint_command_reproduces_its_figure() {
 
 fn verify(more: &[&str]) -> process::Ended {
     let mut command = sightline(["verify", "--viewpoints=4", "--rays=20000", "--json"]);
-    run(command.args(more).arg(&baked().dataset))
+    run(command.args(more).arg(&CITY.dataset))
 }
 
 #[test]
 fn cell_at_a_position_contains_it() {
-    for entry in entries(baked()) {
+    for entry in entries(&CITY) {
         let at = entry.cell.center();
         let found = cell_at(at.x, at.y, at.z).success().json();
         assert_eq!(found["cell"], entry.cell.id.0, "{at}");
@@ -338,7 +320,7 @@ fn cell_at_a_position_contains_it() {
 
 fn cell_at(x: f64, y: f64, z: f64) -> process::Ended {
     let mut command = sightline(["cell", "--json"]);
-    run(command.arg(format!("--at={x},{y},{z}")).arg(&baked().dataset))
+    run(command.arg(format!("--at={x},{y},{z}")).arg(&CITY.dataset))
 }
 
 /// The cells of the dataset, by the reader of the library.
@@ -350,9 +332,9 @@ fn entries(city: &City) -> Vec<CellEntry> {
 }
 
 fn export(cell: CellId, name: &str) -> PathBuf {
-    let out = empty(name).join("cell.glb");
+    let out = CITY.empty(name).join("cell.glb");
     let mut command = sightline(["export", "--cell", &cell.to_string(), "-o"]);
-    let _ = run(command.arg(&out).arg(&baked().dataset)).success();
+    let _ = run(command.arg(&out).arg(&CITY.dataset)).success();
     out
 }
 
@@ -364,7 +346,7 @@ fn info(path: &Path, more: &[&str]) -> Value {
 fn exported_cell_has_the_triangles_of_its_set() {
     let cell = CellId(3);
     let out = export(cell, "exported");
-    let visible = info(&baked().dataset, &["--cell", &cell.to_string()]);
+    let visible = info(&CITY.dataset, &["--cell", &cell.to_string()]);
     let exported = info(&out, &[]);
     let visible = number(&visible["visible_primitives"]);
     assert_eq!(visible, number(&exported["report"]["instanced_triangles"]), "{exported:#}");
@@ -374,7 +356,7 @@ fn exported_cell_has_the_triangles_of_its_set() {
 fn a_budget_keeps_the_most_important_triangles() {
     let ask = |budget: &str| {
         let mut command = sightline(["cell", "--json", "--cell=3", "--budget", budget]);
-        run(command.arg(&baked().dataset)).success().json()["budget"].clone()
+        run(command.arg(&CITY.dataset)).success().json()["budget"].clone()
     };
     let all = ask("1000000");
     let numbers = |value: &Value| value.as_array().expect("a list").clone();
@@ -386,16 +368,16 @@ fn a_budget_keeps_the_most_important_triangles() {
     let some = ask("50");
     assert_eq!(numbers(&some["primitives"])[..], numbers(&all["primitives"])[..50]);
 
-    let out = empty("budget").join("cell.glb");
+    let out = CITY.empty("budget").join("cell.glb");
     let mut command = sightline(["export", "--cell=3", "--budget=50", "-o"]);
-    let _ = run(command.arg(&out).arg(&baked().dataset)).success();
+    let _ = run(command.arg(&out).arg(&CITY.dataset)).success();
     assert_eq!(number(&info(&out, &[])["report"]["instanced_triangles"]), 50.0);
 }
 
 #[test]
 fn a_cell_says_what_it_took_and_whether_its_target_was_met() {
-    for entry in entries(baked()) {
-        let cell = info(&baked().dataset, &["--cell", &entry.cell.id.to_string()]);
+    for entry in entries(&CITY) {
+        let cell = info(&CITY.dataset, &["--cell", &entry.cell.id.to_string()]);
         let of = |key: &str| number(&cell[key]);
         assert!(of("rows") >= 92.0 && of("runs") >= 1.0 && of("segments") >= 4.0, "{cell:#}");
         assert_eq!(of("segments"), 4.0 * of("runs") + of("lines"));
@@ -425,7 +407,7 @@ fn duckdb_answers_the_two_questions() {
     let found = requirement::python_with_duckdb();
     let Some(python) = requirement::program(test, found, install) else { return };
     let script = sightline_tests::workspace::root().join("tests/analytics/query_dataset.py");
-    let answers = run(Command::new(python).arg(script).arg(&baked().dataset)).success().json();
+    let answers = run(Command::new(python).arg(script).arg(&CITY.dataset)).success().json();
     assert_eq!(answers["cells"], CELLS);
     let objects = answers["top_objects"].as_array().expect("a list of objects");
     assert_eq!(objects.len(), 10, "the ten objects seen from most cells");
@@ -436,12 +418,12 @@ fn duckdb_answers_the_two_questions() {
 
 #[test]
 fn info_describes_scene_dataset_and_cell() {
-    let scene = info(&baked().scene, &[]);
+    let scene = info(&CITY.scene, &[]);
     let triangles = number(&scene["report"]["instanced_triangles"]);
     assert!((29_000.0..31_000.0).contains(&triangles), "{triangles}");
-    let dataset = info(&baked().dataset, &[]);
+    let dataset = info(&CITY.dataset, &[]);
     assert_eq!(number(&dataset["summary"]["cells"]), f64::from(CELLS), "{dataset:#}");
-    let missing = run(sightline(["info", "--cell=99"]).arg(&baked().dataset)).failure(3);
+    let missing = run(sightline(["info", "--cell=99"]).arg(&CITY.dataset)).failure(3);
     assert!(missing.stderr.contains("cell 99"), "{}", missing.stderr);
 }
 
@@ -484,7 +466,7 @@ async fn ask(url: String) -> Result<(), Box<dyn std::error::Error>> {
 
 #[test]
 fn demo_ends_with_where_to_look_next() {
-    let out = empty("demo").join("demo");
+    let out = CITY.empty("demo").join("demo");
     let mut command = sightline(["demo", "--triangles=30k", "--out"]);
     let ended = process::run(command.arg(&out), 4 * LIMIT).success();
     assert!(ended.stdout.contains("sightline export"), "{}", ended.stdout);

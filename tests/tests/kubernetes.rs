@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::OnceLock;
+use std::sync::LazyLock;
 
 use k8s_openapi::api::batch::v1::{Job, JobSpec};
 use k8s_openapi::api::core::v1::{ConfigMap, Container, PodSpec, Service};
@@ -20,7 +20,7 @@ use sightline_tests::binaries::sightline;
 use sightline_tests::city::{self, City, LIMIT};
 use sightline_tests::job::Verdict;
 use sightline_tests::manifests::Manifests;
-use sightline_tests::pods::{Cluster, SECURITY, TO_COME, help_of};
+use sightline_tests::pods::{Cluster, SECURITY, help_of};
 use sightline_tests::process::{self, Process, eventually};
 use sightline_tests::{dataset, requirement, workspace};
 use tonic_health::pb::HealthCheckRequest;
@@ -45,24 +45,9 @@ const VARIANTS: [&[&str]; 9] = [
     &["--workers=1", "--name=a-bake", "--namespace=studio", "--store-port=9000"],
 ];
 
-fn folder() -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).join("kubernetes")
-}
-
 /// The city that the Jobs bake, baked once by `sightline bake`.
-fn baked() -> &'static City {
-    static CITY: OnceLock<City> = OnceLock::new();
-    CITY.get_or_init(|| City::bake(&folder().join("city")))
-}
-
-/// An empty folder of one test.
-fn empty(name: &str) -> PathBuf {
-    let folder = folder().join(name);
-    // Left over from the last run of the tests, or not there.
-    let _ = std::fs::remove_dir_all(&folder);
-    std::fs::create_dir_all(&folder).expect("a folder can be made");
-    folder
-}
+static CITY: LazyLock<City> =
+    LazyLock::new(|| City::bake(&Path::new(env!("CARGO_TARGET_TMPDIR")).join("kubernetes")));
 
 /// The street of the shared bake as a configuration file, with tasks cut smaller.
 const STREET: &str = "\
@@ -73,7 +58,7 @@ const STREET: &str = "\
 
 /// The manifests of a bake of the city, and a cluster to run them in.
 fn cluster(name: &str, config: &str) -> Cluster {
-    let folder = empty(name);
+    let folder = CITY.empty(name);
     let config_file = folder.join("bake.toml");
     std::fs::write(&config_file, STREET).expect("a file can be written");
     let mut manifests = Manifests::render(&[
@@ -93,7 +78,7 @@ fn cluster(name: &str, config: &str) -> Cluster {
         }
     }
     let cluster = Cluster::new(&manifests, &folder);
-    std::fs::copy(&baked().scene, cluster.claim().join("city.glb")).expect("the scene is copied");
+    std::fs::copy(&CITY.scene, cluster.claim().join("city.glb")).expect("the scene is copied");
     cluster
 }
 
@@ -130,7 +115,7 @@ fn a_bake_with_one_pod_killed_and_one_evicted_ends_complete_and_whole() {
         let pods = ends.iter().filter(|end| end.index == Some(index)).count();
         assert!(pods >= 2, "index {index} was started again");
     }
-    dataset::assert_same(&baked().dataset, &visible);
+    dataset::assert_same(&CITY.dataset, &visible);
 }
 
 #[test]
@@ -145,7 +130,7 @@ fn an_evicted_coordinator_is_started_again_and_resumes() {
     assert_eq!(coordinator.verdict(), Verdict::Complete("CompletionsReached"));
     assert_eq!((coordinator.failures(), coordinator.ignored()), (0, 1));
     assert_eq!(cluster.state("bake-worker").verdict(), Verdict::Complete("SuccessPolicy"));
-    dataset::assert_same(&baked().dataset, &visible);
+    dataset::assert_same(&CITY.dataset, &visible);
 }
 
 #[test]
@@ -200,8 +185,8 @@ async fn ask_health(port: u16, service: &str) -> Option<ServingStatus> {
 
 #[test]
 fn keda_learns_from_a_real_coordinator_how_many_workers_to_run() {
-    let out = empty("keda");
-    let arguments = city::bake_arguments("coordinator", &baked().scene, &out.join("d"), [2, 1]);
+    let out = CITY.empty("keda");
+    let arguments = city::bake_arguments("coordinator", &CITY.scene, &out.join("d"), [2, 1]);
     let listener = std::net::TcpListener::bind(("127.0.0.1", 0)).expect("a port is free");
     let address = listener.local_addr().expect("it has an address").to_string();
     drop(listener);
@@ -264,7 +249,7 @@ fn every_object_passes_strict_validation() {
     let found = requirement::kubernetes_validate();
     let install = "`.venv` with the packages of tests/kubernetes/requirements.txt";
     let Some(validate) = requirement::program(test, found, install) else { return };
-    let folder = empty("validated");
+    let folder = CITY.empty("validated");
     for (at, flags) in VARIANTS.iter().enumerate() {
         let objects = Manifests::render(flags).objects;
         // KEDA's kinds are no part of Kubernetes; the Job inside a ScaledJob is.
@@ -299,7 +284,7 @@ fn every_object_passes_strict_validation() {
 
 #[test]
 fn the_base_is_what_render_prints() {
-    let folder = empty("base");
+    let folder = CITY.empty("base");
     let mut command = sightline(["k8s", "render", "--quiet", "--output"]);
     let _ = process::run(command.arg(&folder), LIMIT).success();
     let base = workspace::root().join("k8s/base");
@@ -660,16 +645,14 @@ fn containers_are_given_flags_that_the_command_knows() {
         let arguments = container.args.clone().unwrap_or_default();
         let help: BTreeSet<&str> = helps[&arguments[0]].split_whitespace().collect();
         for flag in arguments.iter().map(String::as_str).filter(|word| word.starts_with("--")) {
-            let is_known =
-                help.contains(flag) || SECURITY.contains(&flag) || TO_COME.contains(&flag);
-            assert!(is_known, "{flag} of {} {flags:?}", arguments[0]);
+            assert!(help.contains(flag), "{flag} of {} {flags:?}", arguments[0]);
         }
     });
 }
 
 #[test]
 fn a_wrong_configuration_is_refused_before_it_reaches_the_cluster() {
-    let config = empty("refused").join("bake.toml");
+    let config = CITY.empty("refused").join("bake.toml");
     std::fs::write(&config, "[solver]\nrow = 100\n").expect("a file can be written");
     let mut command = sightline(["k8s", "render", "--config"]);
     let ended = process::run(command.arg(&config), LIMIT).failure(2);

@@ -1,9 +1,9 @@
 //! Object stores, with real servers and the real commands: one conformance suite on every backend, the
 //! same bytes wherever a bake writes, and stores and secrets that are refused.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
-use std::sync::OnceLock;
+use std::sync::LazyLock;
 
 use sightline_store::BakeStore;
 use sightline_tests::binaries::{executable, sightline};
@@ -16,22 +16,9 @@ use sightline_tests::{conformance, dataset, requirement};
 /// A password that no output may show.
 const SECRET: &str = "S3CRET-of-this-test";
 
-fn folder() -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).join("object_stores")
-}
-
 /// The city that all tests share, baked once into a folder.
-fn baked() -> &'static City {
-    static CITY: OnceLock<City> = OnceLock::new();
-    CITY.get_or_init(|| City::bake(&folder()))
-}
-
-/// An empty folder of one test.
-fn empty(name: &str) -> PathBuf {
-    let folder = baked().folder.join(name);
-    std::fs::create_dir(&folder).expect("a folder can be made once");
-    folder
-}
+static CITY: LazyLock<City> =
+    LazyLock::new(|| City::bake(&Path::new(env!("CARGO_TARGET_TMPDIR")).join("object_stores")));
 
 fn run(command: &mut Command) -> Ended {
     process::run(command, LIMIT)
@@ -83,7 +70,7 @@ fn google_keeps_every_promise() {
 fn a_store_that_looks_first_and_writes_later_is_refused() {
     let test = "a_store_that_looks_first_and_writes_later_is_refused";
     let Some(server) = servers::s3s_fs(test) else { return };
-    let refused = run(server.admit(&mut bake(&baked().scene, &server.url("out")))).failure(4);
+    let refused = run(server.admit(&mut bake(&CITY.scene, &server.url("out")))).failure(4);
     assert!(refused.stderr.contains("writers created one object"), "{}", refused.stderr);
     assert!(refused.stderr.contains("conditional writes"), "{}", refused.stderr);
 }
@@ -91,11 +78,11 @@ fn a_store_that_looks_first_and_writes_later_is_refused() {
 /// Bakes to a server, compares the dataset with that in a folder, and asks about it.
 fn same_dataset_and_answers(server: &Server) {
     let url = server.url("a bake/visible").replace(' ', "%20");
-    let _ = run(server.admit(&mut bake(&baked().scene, &url))).success();
+    let _ = run(server.admit(&mut bake(&CITY.scene, &url))).success();
     let copy = server.fetch("a%20bake/visible");
-    dataset::assert_same(&baked().dataset, &copy);
+    dataset::assert_same(&CITY.dataset, &copy);
 
-    let here = baked().dataset.display().to_string();
+    let here = CITY.dataset.display().to_string();
     let ask = |arguments: &[&str], location: &str| {
         let mut command = sightline(arguments);
         run(server.admit(command.args(["--json", location]))).success().json()
@@ -106,7 +93,7 @@ fn same_dataset_and_answers(server: &Server) {
             assert_eq!(there[key], here[key], "{key} of {question:?}");
         }
     }
-    let out = baked().folder.join(format!("cell-of-{}.glb", server.port()));
+    let out = CITY.folder.join(format!("cell-of-{}.glb", server.port()));
     let out = out.display().to_string();
     let exported = ask(&["export", "--cell=3", "-o", &out], &url);
     assert!(exported["triangles"].as_u64() > Some(0), "{exported:#}");
@@ -132,11 +119,11 @@ fn a_bake_to_azure_gives_the_bytes_of_a_bake_to_a_folder() {
 fn a_cluster_over_s3_survives_a_killed_worker_and_needs_no_shared_folder() {
     let test = "a_cluster_over_s3_survives_a_killed_worker_and_needs_no_shared_folder";
     let Some(moto) = servers::moto(test) else { return };
-    let folder = empty("cluster");
+    let folder = CITY.empty("cluster");
     let url = moto.url("cluster");
     // The workers' way to the scene is the store: its path is gone once the coordinator listens.
     let scene = folder.join("city.glb");
-    std::fs::copy(&baked().scene, &scene).expect("a scene can be copied");
+    std::fs::copy(&CITY.scene, &scene).expect("a scene can be copied");
     let port = servers::free_port();
     let listen = format!("127.0.0.1:{port}");
     let mut command =
@@ -160,7 +147,7 @@ fn a_cluster_over_s3_survives_a_killed_worker_and_needs_no_shared_folder() {
     victim.kill();
     let _ = coordinator.wait(LIMIT).success();
     let _ = other.wait(LIMIT).success();
-    dataset::assert_same(&baked().dataset, &moto.fetch("cluster"));
+    dataset::assert_same(&CITY.dataset, &moto.fetch("cluster"));
     let files = std::fs::read_dir(cache.join("files")).expect("it is there").count();
     assert_eq!(files, 1, "one copy for both");
 }
@@ -169,12 +156,12 @@ fn a_cluster_over_s3_survives_a_killed_worker_and_needs_no_shared_folder() {
 fn a_scene_in_a_bucket_is_baked_and_verified_from_there() {
     let test = "a_scene_in_a_bucket_is_baked_and_verified_from_there";
     let Some(moto) = servers::moto(test) else { return };
-    let folder = empty("scene-in-a-bucket");
+    let folder = CITY.empty("scene-in-a-bucket");
     let (scene, out) = (moto.url("scenes/city.glb"), folder.join("out").display().to_string());
-    moto.objects(&["put", &moto.url("scenes"), "city.glb", &baked().scene.display().to_string()]);
+    moto.objects(&["put", &moto.url("scenes"), "city.glb", &CITY.scene.display().to_string()]);
     let cache = format!("--cache={}", folder.join("cache").display());
     let _ = run(moto.admit(bake(Path::new(&scene), &out).arg(&cache))).success();
-    dataset::assert_same(&baked().dataset, Path::new(&out));
+    dataset::assert_same(&CITY.dataset, Path::new(&out));
     // The scene is found again by the URL that the bake read it from.
     let mut verify = sightline(["verify", "--cells=1", "--viewpoints=1", "--rays=1000", &cache]);
     let _ = run(moto.admit(verify.arg(&out))).success();
@@ -189,12 +176,12 @@ fn a_scene_in_a_bucket_is_baked_and_verified_from_there() {
 fn a_bake_on_a_bad_day_gives_the_same_bytes() {
     let Some(moto) = servers::moto("a_bake_on_a_bad_day_gives_the_same_bytes") else { return };
     let proxy = FlakyProxy::before(moto.port(), Faults::bad_day(5));
-    let mut command = bake(&baked().scene, &moto.url("bad-day"));
+    let mut command = bake(&CITY.scene, &moto.url("bad-day"));
     moto.admit(&mut command);
     command.env("AWS_ENDPOINT_URL", format!("http://127.0.0.1:{}", proxy.port()));
     command.env("AWS_TIMEOUT", "2 seconds");
     let _ = run(&mut command).success();
-    dataset::assert_same(&baked().dataset, &moto.fetch("bad-day"));
+    dataset::assert_same(&CITY.dataset, &moto.fetch("bad-day"));
     let met: Vec<(Fault, u64)> = Fault::ALL.into_iter().map(|f| (f, proxy.met(f))).collect();
     for fault in [Fault::CutAfter, Fault::ErrorAfter] {
         assert!(proxy.met(fault) > 0, "{met:?} of {}", proxy.requests());
@@ -204,7 +191,7 @@ fn a_bake_on_a_bad_day_gives_the_same_bytes() {
 #[test]
 fn a_store_that_lets_nobody_in_says_what_to_do() {
     let test = "a_store_that_lets_nobody_in_says_what_to_do";
-    let bake_to = |url: &str| bake(&baked().scene, url);
+    let bake_to = |url: &str| bake(&CITY.scene, url);
     let metadata = std::net::SocketAddr::from(([169, 254, 169, 254], 80));
     let wait = std::time::Duration::from_secs(1);
     if std::net::TcpStream::connect_timeout(&metadata, wait).is_ok() {
@@ -215,7 +202,7 @@ fn a_store_that_lets_nobody_in_says_what_to_do() {
     let ended = run(servers::shut_out(&mut command)).failure(4);
     assert!(ended.stderr.contains("AWS_ACCESS_KEY_ID"), "{}", ended.stderr);
     let mut command = bake_to("gs://box/out");
-    let ended = run(servers::shut_out(&mut command).env("HOME", empty("no-home"))).failure(4);
+    let ended = run(servers::shut_out(&mut command).env("HOME", CITY.empty("no-home"))).failure(4);
     assert!(ended.stderr.contains("GOOGLE_APPLICATION_CREDENTIALS"), "{}", ended.stderr);
     let mut command = bake_to("az://box/out");
     servers::shut_out(&mut command).env("AZURE_STORAGE_ACCOUNT_NAME", "someone");
@@ -248,12 +235,12 @@ fn secrets_of_a_url_appear_nowhere() {
     };
     // A signature that the server refuses: it comes back in no message and no log.
     let signed = format!("{}?sv=2021-12-02&sp=rwl&sig={SECRET}", azurite.url("signed"));
-    let mut command = bake(&baked().scene, &signed);
+    let mut command = bake(&CITY.scene, &signed);
     let ended = run(azurite.admit(&mut command).env("RUST_LOG", "debug")).failure(4);
     is_silent(&ended);
     assert!(ended.stderr.contains("the server says Auth"), "{}", ended.stderr);
     for url in [format!("s3://key:{SECRET}@box/out"), format!("gs://box/out?token={SECRET}")] {
-        for command in [&mut bake(&baked().scene, &url), sightline(["info"]).arg(&url)] {
+        for command in [&mut bake(&CITY.scene, &url), sightline(["info"]).arg(&url)] {
             let ended = run(command);
             assert!(!ended.status.success());
             is_silent(&ended);

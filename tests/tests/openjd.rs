@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::OnceLock;
+use std::sync::LazyLock;
 
 use sightline_tests::binaries::executable;
 use sightline_tests::city::{City, LIMIT};
@@ -16,15 +16,9 @@ const STREET: &str = "\
     [accuracy]\ntarget_error = 0.0001\nworst_error = 0.001\nrounds = 3\n\
     [tasks]\nsegments_per_task = 2\ncells_per_task = 1\n";
 
-fn folder() -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).join("openjd")
-}
-
 /// The city, baked once by `sightline bake`.
-fn baked() -> &'static City {
-    static CITY: OnceLock<City> = OnceLock::new();
-    CITY.get_or_init(|| City::bake(&folder().join("city")))
-}
+static CITY: LazyLock<City> =
+    LazyLock::new(|| City::bake(&Path::new(env!("CARGO_TARGET_TMPDIR")).join("openjd")));
 
 fn template() -> PathBuf {
     workspace::root().join("k8s/openjd/bake.template.yaml")
@@ -44,10 +38,7 @@ struct Job {
 impl Job {
     /// A job in an empty folder, with this configuration.
     fn new(openjd: PathBuf, name: &str, config: &str) -> Self {
-        let folder = folder().join(name);
-        // Left over from the last run of the tests, or not there.
-        let _ = std::fs::remove_dir_all(&folder);
-        std::fs::create_dir_all(&folder).expect("a folder can be made");
+        let folder = CITY.empty(name);
         std::fs::write(folder.join("bake.toml"), config).expect("a file can be written");
         Self { openjd, folder }
     }
@@ -60,7 +51,7 @@ impl Job {
         let mut command = Command::new(&self.openjd);
         command.arg("run").arg(template()).args(["--step", step]);
         let parameters = [
-            ("Scene", baked().scene.clone()),
+            ("Scene", CITY.scene.clone()),
             ("Config", self.folder.join("bake.toml")),
             ("Out", self.out()),
             ("Sightline", executable("sightline").to_owned()),
@@ -90,7 +81,7 @@ fn a_bake_on_a_farm_writes_the_bytes_of_bake_with_helpers_beside_it() {
     let bake = job.step("Bake");
     let bake = bake.wait(LIMIT).success();
     let _ = help.wait(LIMIT).success();
-    dataset::assert_same(&baked().dataset, &job.out());
+    dataset::assert_same(&CITY.dataset, &job.out());
     // The runner takes what it knows for messages of the job.
     assert!(bake.stdout.contains("openjd_progress: 100.0"), "{}", bake.stdout);
     assert!(bake.stdout.contains("openjd_status: bake "), "{}", bake.stdout);

@@ -1,12 +1,12 @@
 //! Who is refused, and that nothing else suffers from it: real coordinators, sockets and TLS.
 
 use std::io::{Read, Write};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::OnceLock;
+use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use sightline_proto::access::Role;
 use sightline_proto::v1;
@@ -16,6 +16,7 @@ use sightline_tests::certificates::{Authority, Files};
 use sightline_tests::city::{self, City, LIMIT};
 use sightline_tests::dataset;
 use sightline_tests::process::{Process, eventually};
+use sightline_tests::servers::free_port;
 use sightline_worker::ClientSecurity;
 use sightline_worker::security::Client;
 use tokio::runtime::Runtime;
@@ -24,26 +25,9 @@ use tonic::{Code, Status};
 const WORKER_TOKEN: &str = "0123456789abcdef-worker";
 const VIEWER_TOKEN: &str = "0123456789abcdef-viewer";
 
-fn folder() -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).join("security")
-}
-
 /// The city that all tests share, baked once.
-fn baked() -> &'static City {
-    static CITY: OnceLock<City> = OnceLock::new();
-    CITY.get_or_init(|| City::bake(&folder()))
-}
-
-fn empty(name: &str) -> PathBuf {
-    let folder = baked().folder.join(name);
-    std::fs::create_dir(&folder).expect("a folder can be made once");
-    folder
-}
-
-fn free_port() -> u16 {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a port is free");
-    listener.local_addr().expect("it has an address").port()
-}
+static CITY: LazyLock<City> =
+    LazyLock::new(|| City::bake(&Path::new(env!("CARGO_TARGET_TMPDIR")).join("security")));
 
 /// A coordinator that is secured somehow.
 struct Secured {
@@ -55,10 +39,10 @@ struct Secured {
 
 impl Secured {
     fn start(name: &str, secure: impl FnOnce(&Path, &mut Command)) -> Self {
-        let folder = empty(name);
+        let folder = CITY.empty(name);
         let dataset = folder.join("dataset");
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, free_port()));
-        let arguments = city::bake_arguments("coordinator", &baked().scene, &dataset, [3, 1]);
+        let arguments = city::bake_arguments("coordinator", &CITY.scene, &dataset, [3, 1]);
         let mut command = sightline(arguments);
         command.arg("--listen").arg(address.to_string());
         secure(&folder, &mut command);
@@ -217,10 +201,12 @@ fn with_certificates_strangers_are_refused_and_the_bake_goes_on() {
     let plain = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
     is_closed_on(secured.address, plain);
     secured.logs("decoded message length too large", || {
-        let mut speaker = client(&with(&ca.file(), Some(&worker)), &url, Role::Worker)
-            .max_encoding_message_size(64 << 20);
         let request = registration("x".repeat(sightline_proto::MESSAGE_BYTES_MAX + 1));
-        refused(runtime.block_on(speaker.register(request)), &[Code::OutOfRange]);
+        let answer = runtime.block_on(async {
+            let speaker = client(&with(&ca.file(), Some(&worker)), &url, Role::Worker);
+            speaker.max_encoding_message_size(64 << 20).register(request).await
+        });
+        refused(answer, &[Code::OutOfRange]);
     });
     // Who does not trust the coordinator does not talk to it.
     refused(look(&runtime, &with(&other.file(), Some(&viewer)), &url), &gone);
@@ -257,7 +243,7 @@ fn with_certificates_strangers_are_refused_and_the_bake_goes_on() {
         let body = key.lines().nth(1).expect("PEM has lines");
         assert!(!ended.stderr.contains(body), "no secret is logged");
     }
-    dataset::assert_same(&baked().dataset, &secured.dataset);
+    dataset::assert_same(&CITY.dataset, &secured.dataset);
 }
 
 #[test]
@@ -315,14 +301,14 @@ fn with_tokens_strangers_are_refused_and_the_bake_goes_on() {
         assert!(!log.contains(WORKER_TOKEN) && !log.contains(VIEWER_TOKEN), "no secret is logged");
     }
     assert!(!ended.stderr.contains("panicked"), "{}", ended.stderr);
-    dataset::assert_same(&baked().dataset, &secured.dataset);
+    dataset::assert_same(&CITY.dataset, &secured.dataset);
 }
 
 #[test]
 fn an_open_coordinator_beyond_loopback_is_refused_with_what_to_do() {
-    let folder = empty("open");
+    let folder = CITY.empty("open");
     let arguments =
-        city::bake_arguments("coordinator", &baked().scene, &folder.join("dataset"), [3, 1]);
+        city::bake_arguments("coordinator", &CITY.scene, &folder.join("dataset"), [3, 1]);
     let mut command = sightline(arguments);
     command.args(["--listen", "0.0.0.0:0"]);
     let ended = Process::start(&mut command, &folder, "coordinator").wait(LIMIT).failure(2);
@@ -346,9 +332,18 @@ fn health_is_answered_in_plain_text_beside_an_encrypted_service() {
         let url = format!("http://127.0.0.1:{probes}");
         let channel = tonic::transport::Endpoint::from_shared(url).expect("a URL");
         let channel = channel.connect().await.expect("probes connect");
-        let request = HealthCheckRequest { service: "sightline.v1.Coordinator".into() };
-        let answer = HealthClient::new(channel.clone()).check(request).await.expect("it answers");
-        assert_eq!(answer.into_inner().status, 1, "serving");
+        // It listens before it says that it serves.
+        let deadline = Instant::now() + LIMIT;
+        loop {
+            let request = HealthCheckRequest { service: "sightline.v1.Coordinator".into() };
+            let answer = HealthClient::new(channel.clone()).check(request).await;
+            let is_serving = answer.is_ok_and(|answer| answer.into_inner().status == 1);
+            if is_serving {
+                break;
+            }
+            assert!(Instant::now() < deadline, "it never says that it serves");
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
         let mut service = v1::coordinator_client::CoordinatorClient::new(channel);
         let answer = service.get_status(v1::GetStatusRequest {}).await;
         assert_eq!(answer.expect_err("nothing else is there").code(), Code::Unimplemented);
@@ -359,9 +354,9 @@ fn health_is_answered_in_plain_text_beside_an_encrypted_service() {
 #[test]
 fn a_coordinator_under_random_requests_answers_and_keeps_its_state() {
     let campaign = Campaign {
-        folder: empty("fuzzed"),
-        scene: baked().scene.clone(),
-        baked: baked().dataset.clone(),
+        folder: CITY.empty("fuzzed"),
+        scene: CITY.scene.clone(),
+        baked: CITY.dataset.clone(),
         seed: 1,
         time: Duration::from_secs(5),
         attackers: 2,

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{Read, Write};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -21,6 +21,7 @@ use sightline_telemetry::metrics::{Registry, text_of};
 use sightline_tests::binaries::sightline;
 use sightline_tests::city::{self, LIMIT};
 use sightline_tests::process::{self, Process, eventually};
+use sightline_tests::servers::free_port;
 use sightline_tests::{dataset, workspace};
 use sightline_worker::Metrics as WorkerMetrics;
 use tokio_stream::wrappers::TcpListenerStream;
@@ -48,11 +49,6 @@ impl TraceService for Receiver {
         }
         Ok(tonic::Response::new(ExportTraceServiceResponse::default()))
     }
-}
-
-fn free_port() -> u16 {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a port is free");
-    listener.local_addr().expect("it has an address").port()
 }
 
 fn get(port: u16, path: &str) -> Option<String> {

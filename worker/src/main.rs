@@ -4,13 +4,13 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use bytesize::ByteSize;
 use clap::Parser;
 use sightline_scene::{MemoryLimit, default_folder};
-use sightline_store::{BakeStore, ByteSize};
+use sightline_store::BakeStore;
 use sightline_telemetry::metrics::{Listener, Registry};
-use sightline_telemetry::stop::signalled;
-use sightline_telemetry::{LogOptions, Telemetry, WatchFlags};
-use sightline_worker::{ClientSecurity, SceneAccess, Worker, WorkerOptions, WorkerSummary};
+use sightline_telemetry::{LogOptions, WatchFlags, stop};
+use sightline_worker::{ClientSecurity, SceneAccess, Worker, WorkerOptions};
 
 /// Leases tasks from a coordinator, solves them, writes the results.
 #[derive(Debug, Parser)]
@@ -66,36 +66,10 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let format = arguments.watch.log_format;
     let logs = LogOptions { format, filter: "info", service: "sightline-worker" };
-    let telemetry = Telemetry::to_stderr(logs);
-    let runtime = tokio::runtime::Runtime::new().map_err(Error::from);
-    let ended = match (&telemetry, runtime) {
-        (Err(error), _) => Err(error.to_string().into()),
-        (_, Err(error)) => Err(error),
-        (Ok(_), Ok(runtime)) => runtime.block_on(run(arguments)),
-    };
-    match ended {
-        Ok(summary) => {
-            let solve_ms = u64::try_from(summary.solve_time.as_millis()).unwrap_or(u64::MAX);
-            tracing::info!(
-                tasks = summary.tasks,
-                failures = summary.failures,
-                solve_ms,
-                published = summary.published,
-                end = summary.message,
-                chunks_loaded = summary.held.map(|held| held.loaded),
-                chunks_given_back = summary.held.map(|held| held.given_back),
-                "done"
-            );
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            tracing::error!("{error}");
-            ExitCode::FAILURE
-        }
-    }
+    stop::run(logs, run(arguments))
 }
 
-async fn run(arguments: Arguments) -> Result<WorkerSummary, Error> {
+async fn run(arguments: Arguments) -> Result<(), Error> {
     let mut options = WorkerOptions::new(&arguments.coordinator);
     options.scene_path = arguments.scene;
     options.scene_access = SceneAccess {
@@ -117,5 +91,17 @@ async fn run(arguments: Arguments) -> Result<WorkerSummary, Error> {
         Some(address) => Some(Listener::start(address, registry).await?),
         None => None,
     };
-    Ok(Worker::run(options, signalled()).await?)
+    let summary = Worker::run(options, stop::signalled()).await?;
+    let solve_ms = u64::try_from(summary.solve_time.as_millis()).unwrap_or(u64::MAX);
+    tracing::info!(
+        tasks = summary.tasks,
+        failures = summary.failures,
+        solve_ms,
+        published = summary.published,
+        end = summary.message,
+        chunks_loaded = summary.held.map(|held| held.loaded),
+        chunks_given_back = summary.held.map(|held| held.given_back),
+        "done"
+    );
+    Ok(())
 }

@@ -7,8 +7,15 @@ use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
-use sightline_jobs::FailureClass;
-use sightline_telemetry::metrics::{Label, Registry, StoreMetrics, duration_buckets};
+use sightline_jobs::{FailureClass, TaskKind};
+use sightline_store::Operation;
+use sightline_telemetry::metrics::{Label, Registry, StoreMetrics, begin, duration_buckets};
+
+const COMMITTED: &str = "committed";
+const GIVEN_UP: &str = "given_up";
+const FAILED: &str = "failed";
+/// How attempts end.
+const RESULTS: [&str; 3] = [COMMITTED, GIVEN_UP, FAILED];
 
 /// The metrics of a worker. Clones count together.
 #[derive(Clone, Debug)]
@@ -24,14 +31,18 @@ pub struct Metrics {
 
 impl Default for Metrics {
     fn default() -> Self {
-        Self {
+        let metrics = Self {
             attempts: Family::default(),
             failures: Family::default(),
             durations: Family::new_with_constructor(duration_buckets),
             leases: Gauge::default(),
             registrations: Counter::default(),
-            store: StoreMetrics::default(),
-        }
+            store: StoreMetrics::new(&Operation::KINDS, &Operation::RESULTS),
+        };
+        begin(&metrics.attempts, "result", RESULTS);
+        begin(&metrics.failures, "class", FailureClass::ALL.map(FailureClass::name));
+        begin(&metrics.durations, "kind", TaskKind::NAMES);
+        metrics
     }
 }
 
@@ -72,16 +83,16 @@ impl Metrics {
     }
 
     pub(crate) fn committed(&self, kind: &'static str, solve_time: Duration) {
-        self.attempts.get_or_create(&[("result", "committed")]).inc();
+        self.attempts.get_or_create(&[("result", COMMITTED)]).inc();
         self.durations.get_or_create(&[("kind", kind)]).observe(solve_time.as_secs_f64());
     }
 
     pub(crate) fn given_up(&self) {
-        self.attempts.get_or_create(&[("result", "given_up")]).inc();
+        self.attempts.get_or_create(&[("result", GIVEN_UP)]).inc();
     }
 
     pub(crate) fn failed(&self, class: FailureClass) {
-        self.attempts.get_or_create(&[("result", "failed")]).inc();
+        self.attempts.get_or_create(&[("result", FAILED)]).inc();
         self.failures.get_or_create(&[("class", class.name())]).inc();
     }
 }

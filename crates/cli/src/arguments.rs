@@ -5,12 +5,13 @@
 
 use std::path::PathBuf;
 
+use bytesize::ByteSize;
 use clap::{ArgAction, ArgMatches, Args, Command, FromArgMatches, Parser, Subcommand, ValueEnum};
 use sightline_coordinator::{SecurityFlags, ShareScene};
 use sightline_geometry::CellId;
 use sightline_jobs::{KEYS, KeyDoc};
 use sightline_scene::{MemoryLimit, default_folder};
-use sightline_store::{ByteSize, CACHE_BYTES_MAX};
+use sightline_store::CACHE_BYTES_MAX;
 use sightline_telemetry::{LogFormat, WatchFlags};
 use sightline_worker::ClientSecurity;
 

@@ -161,8 +161,10 @@ pub enum TaskKind {
 }
 
 impl TaskKind {
+    /// The names of the kinds, by number, for logs and metrics.
+    pub const NAMES: [&str; 3] = ["segments", "cells", "join"];
     /// Number of kinds.
-    pub const KINDS: usize = 3;
+    pub const KINDS: usize = Self::NAMES.len();
 
     /// Number of the kind, below [`TaskKind::KINDS`].
     #[must_use]
@@ -177,11 +179,7 @@ impl TaskKind {
     /// The name, for logs and metrics.
     #[must_use]
     pub const fn name(&self) -> &'static str {
-        match self {
-            Self::Segments { .. } => "segments",
-            Self::Cells { .. } => "cells",
-            Self::Join { .. } => "join",
-        }
+        Self::NAMES[self.index()]
     }
 
     /// Number of segments or cells. Each counts once a task, whatever the number of states: most of

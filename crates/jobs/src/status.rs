@@ -90,23 +90,11 @@ pub struct LeaseStatus {
     pub attempt: u32,
     /// Time since it was given out, ms.
     pub age_ms: u64,
-    /// Mean computing time of the committed tasks of its kind, ms; 0 when none is known.
-    pub usual_ms: u64,
-}
-
-impl LeaseStatus {
-    /// Times the usual that an attempt takes before it counts as straggling.
-    pub const STRAGGLER_TIMES: u64 = 3;
-    /// Shortest age of a straggler, ms: reading and writing take time too.
-    pub const STRAGGLER_MS_MIN: u64 = 5_000;
-
-    /// True when the attempt runs much longer than others of its kind.
-    #[must_use]
-    pub const fn is_straggler(&self) -> bool {
-        self.usual_ms > 0
-            && self.age_ms >= Self::STRAGGLER_MS_MIN
-            && self.age_ms > self.usual_ms.saturating_mul(Self::STRAGGLER_TIMES)
-    }
+    /// How long the task should take from its lease to its commit, ms, as the committed ones tell; 0 when
+    /// they tell nothing yet.
+    pub predicted_ms: u64,
+    /// True when it takes so much longer that an idle worker gets a second attempt: a straggler.
+    pub is_overdue: bool,
 }
 
 /// A task that was attempted more than once.

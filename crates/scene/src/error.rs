@@ -10,7 +10,9 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use crate::{memory::ByteSize, particles::TableProblem};
+use bytesize::ByteSize;
+
+use crate::particles::TableProblem;
 
 /// A scene that was refused.
 #[derive(Debug)]

@@ -20,7 +20,7 @@ mod scene;
 
 pub use digest::{FileDigest, SceneDigest, digest, digest_with, external_buffers};
 pub use error::{Cause, Place, SceneError, UriProblem};
-pub use memory::{ByteSize, Held, Keeper, MemoryLimit, SizeError, default_folder};
+pub use memory::{Held, Keeper, MemoryLimit, default_folder};
 pub use numbering::morton;
 pub use particles::{ParticleSource, TableProblem};
 pub use report::{DegenerateTriangles, IgnoredChannels, IngestReport, SkippedPrimitives};

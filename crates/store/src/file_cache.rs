@@ -25,7 +25,6 @@ use std::fs::{self, File, TryLockError};
 use std::hash::{BuildHasher, RandomState};
 use std::io;
 use std::path::{Component, Path, PathBuf};
-use std::str::FromStr;
 use std::time::{Duration, SystemTime};
 
 use crate::{BakeStore, ObjectVersion, Result, StoreError};
@@ -435,50 +434,4 @@ fn hash_of(path: &Path) -> io::Result<blake3::Hash> {
     let mut hasher = blake3::Hasher::new();
     hasher.update_reader(File::open(path)?)?;
     Ok(hasher.finalize())
-}
-
-/// A size in bytes as people write it: `20GiB`, `500MB`, `1000000`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ByteSize(pub u64);
-
-impl FromStr for ByteSize {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let text = text.trim();
-        let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic() || c == ' ');
-        let factor: u64 = match text[digits.len()..].trim() {
-            "" | "B" => 1,
-            "KiB" => 1 << 10,
-            "MiB" => 1 << 20,
-            "GiB" => 1 << 30,
-            "TiB" => 1 << 40,
-            "kB" => 1_000,
-            "MB" => 1_000_000,
-            "GB" => 1_000_000_000,
-            "TB" => 1_000_000_000_000,
-            _ => 0,
-        };
-        let bytes = digits.parse::<u64>().ok().and_then(|n| n.checked_mul(factor));
-        bytes
-            .filter(|bytes| *bytes > 0)
-            .map(Self)
-            .ok_or_else(|| format!("`{text}` is no size; write 20GiB, 500MB or a number of bytes"))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes_are_read_as_people_write_them() {
-        let size = |text: &str| text.parse::<ByteSize>().map(|s| s.0);
-        assert_eq!(size("20GiB"), Ok(20 << 30));
-        assert_eq!(size("500 MB"), Ok(500_000_000));
-        assert_eq!(size("4096"), Ok(4096));
-        for wrong in ["", "GiB", "-1", "0", "3 apples", "99999999999TiB", "1.5GiB"] {
-            assert!(size(wrong).is_err(), "{wrong}");
-        }
-    }
 }

@@ -34,7 +34,7 @@ mod writer;
 pub use access::{BakeStore, Created, ObjectVersion, is_url, key_beside, local_path, redacted};
 pub use codec::{DecodeError, decode_set, encode_set};
 pub use error::{ErrorClass, Result, StoreError};
-pub use file_cache::{ByteSize, CACHE_BYTES_MAX, CachedFile, FileCache, FileView};
+pub use file_cache::{CACHE_BYTES_MAX, CachedFile, FileCache, FileView};
 pub use keys::PartKind;
 pub use manifest::{
     BoxRecord, DataFile, FORMAT, FileKind, Manifest, Pointer, SceneFile, SceneSource, Totals,

@@ -28,6 +28,13 @@ pub struct Operation {
     pub time: Duration,
 }
 
+impl Operation {
+    /// Every kind.
+    pub const KINDS: [&str; 5] = ["get", "put", "list", "copy", "delete"];
+    /// Every result.
+    pub const RESULTS: [&str; 4] = ["ok", "not_found", "already_exists", "error"];
+}
+
 /// Who is told of operations.
 pub type Observer = Arc<dyn Fn(Operation) + Send + Sync>;
 
@@ -161,6 +168,10 @@ mod tests {
         assert!(store.get_if_exists("b").await.unwrap().is_none());
         assert_eq!(store.list("").await.unwrap().len(), 1);
         let told = told.lock().unwrap();
+        let is_listed = |&(kind, result)| {
+            Operation::KINDS.contains(&kind) && Operation::RESULTS.contains(&result)
+        };
+        assert!(told.iter().all(is_listed), "{told:?}");
         // Who finds an object there looks whether it is its own.
         let found = [("put", "already_exists"), ("get", "ok")];
         let others = [("get", "not_found"), ("list", "ok")];

@@ -16,7 +16,7 @@ use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
-use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::family::{Family, MetricConstructor};
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 pub use prometheus_client::registry::Registry;
 use tokio::net::TcpListener;
@@ -132,6 +132,18 @@ pub fn duration_buckets() -> Histogram {
 
 /// One label.
 pub type Label = [(&'static str, &'static str); 1];
+/// Makes a series for each of these values of a label, at zero: what has not happened can be asked for
+/// as well.
+pub fn begin<M: Clone, C: MetricConstructor<M>>(
+    family: &Family<Label, M, C>,
+    label: &'static str,
+    values: impl IntoIterator<Item = &'static str>,
+) {
+    for value in values {
+        drop(family.get_or_create(&[(label, value)]));
+    }
+}
+
 /// Two labels.
 pub type Labels = [(&'static str, &'static str); 2];
 
@@ -142,16 +154,25 @@ pub struct StoreMetrics {
     durations: Family<Label, Histogram, fn() -> Histogram>,
 }
 
-impl Default for StoreMetrics {
-    fn default() -> Self {
-        Self {
+impl StoreMetrics {
+    /// Metrics of operations of these kinds with these results. Every series is there from the start, at
+    /// zero: what has not happened can be asked for as well.
+    #[must_use]
+    pub fn new(kinds: &[&'static str], results: &[&'static str]) -> Self {
+        let metrics = Self {
             operations: Family::default(),
             durations: Family::new_with_constructor(duration_buckets),
+        };
+        for kind in kinds {
+            drop(metrics.durations.get_or_create(&[("operation", *kind)]));
+            for result in results {
+                let labels = [("operation", *kind), ("result", *result)];
+                drop(metrics.operations.get_or_create(&labels));
+            }
         }
+        metrics
     }
-}
 
-impl StoreMetrics {
     /// Makes them known to a registry.
     pub fn register(&self, registry: &mut Registry) {
         registry.register(
@@ -197,7 +218,8 @@ mod tests {
 
     #[tokio::test]
     async fn metrics_are_served_and_nothing_else_is() {
-        let (mut registry, store) = (Registry::default(), StoreMetrics::default());
+        let (mut registry, store) =
+            (Registry::default(), StoreMetrics::new(&["get"], &["ok", "error"]));
         store.register(&mut registry);
         store.operation("get", "ok", Duration::from_millis(5));
         let listener = Listener::start(([127, 0, 0, 1], 0).into(), registry).await.unwrap();

@@ -1,21 +1,63 @@
-//! When a process is asked to stop.
+//! When a process is asked to stop, and how one that serves a bake runs and ends.
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use crate::{LogOptions, Telemetry};
+
+/// Exit code of a process that was asked twice to stop, as shells have it for Ctrl-C.
+pub const INTERRUPTED: i32 = 130;
 
 /// Until someone asks the process to stop: SIGTERM, as container platforms and service managers
-/// send it, or Ctrl-C.
+/// send it, or Ctrl-C. Asked once more, the process ends at once, with [`INTERRUPTED`].
 pub async fn signalled() {
+    if !next_signal().await {
+        // No handler could be set: the default action ends the process.
+        std::future::pending::<()>().await;
+    }
+    tokio::spawn(async {
+        if next_signal().await {
+            std::process::exit(INTERRUPTED);
+        }
+    });
+}
+
+/// True at the next signal, false when there is no telling.
+async fn next_signal() -> bool {
     #[cfg(unix)]
     {
         use tokio::signal::unix::{SignalKind, signal};
         if let Ok(mut terminate) = signal(SignalKind::terminate()) {
-            tokio::select! {
-                _ = terminate.recv() => {}
-                _ = tokio::signal::ctrl_c() => {}
-            }
-            return;
+            return tokio::select! {
+                _ = terminate.recv() => true,
+                interrupted = tokio::signal::ctrl_c() => interrupted.is_ok(),
+            };
         }
     }
-    // Without a handler the default action applies: the process ends.
-    if tokio::signal::ctrl_c().await.is_err() {
-        std::future::pending::<()>().await;
+    tokio::signal::ctrl_c().await.is_ok()
+}
+
+/// Runs a process to its end, with its logs on standard error. A failure is logged and is its exit code.
+pub fn run<E: std::fmt::Display>(
+    logs: LogOptions,
+    process: impl Future<Output = Result<(), E>>,
+) -> ExitCode {
+    let telemetry = match Telemetry::to_stderr(logs) {
+        Ok(telemetry) => telemetry,
+        Err(error) => {
+            // There are no logs to say it in. Where there is no standard error, there is the exit code.
+            let _ = writeln!(std::io::stderr(), "{error}");
+            return ExitCode::FAILURE;
+        }
+    };
+    let ended = match tokio::runtime::Runtime::new() {
+        Ok(runtime) => runtime.block_on(process).map_err(|error| error.to_string()),
+        Err(error) => Err(error.to_string()),
+    };
+    if let Err(error) = &ended {
+        tracing::error!("{error}");
     }
+    // Sends the traces that are left.
+    drop(telemetry);
+    if ended.is_ok() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }

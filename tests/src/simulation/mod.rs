@@ -4,10 +4,10 @@
 //! history, to the last message. Two hosts can be the coordinator and three are workers; turmoil runs
 //! them on one thread, each with a clock of its own. What is real: the gRPC services and clients, the
 //! scheduler, the journal, attempts, commits, the writing and publishing of the dataset. What is
-//! simulated: sockets, time, the store's front ([`store`]), and how long a computation takes; its result
+//! simulated: sockets, time, the store's front (`store`), and how long a computation takes; its result
 //! is computed once a task and remembered, since it is a function of the plan.
 //!
-//! Faults ([`faults`]): crashes and restarts of every host, polite stops, partitions in both directions
+//! Faults (`faults`): crashes and restarts of every host, polite stops, partitions in both directions
 //! and one, messages held back, a second coordinator while the first still runs, clocks that jump and run
 //! fast or slow, workers that slow down or fail tasks, and a store that is out of reach for a host,
 //! applies a write long after its writer has been told that it failed, loses answers and repeats

@@ -14,6 +14,7 @@ use sightline_coordinator::{
 use sightline_jobs::{BakeConfig, BakeStatus, Done, Phase, Plan};
 use sightline_scene::{Keeper, SceneDigest};
 use sightline_store::{BakeStore, Dataset, StoreError, keys};
+use sightline_telemetry::stop::signalled;
 use sightline_worker::{Worker, WorkerOptions};
 use tokio::sync::oneshot;
 
@@ -209,7 +210,7 @@ pub async fn watch(coordinator: &mut CoordinatorHandle, mut phases: Option<&mut 
     let all = parts(&first).iter().map(|part| part.total).sum();
     let mut progress = Progress::new("bake", "units", all);
     let mut merging = false;
-    let mut signal = std::pin::pin!(stop_signal());
+    let mut signal = std::pin::pin!(signalled());
     loop {
         let now = status.borrow_and_update().clone();
         progress.set(parts(&now).iter().map(|part| part.done).sum(), &standing(&now));
@@ -249,35 +250,6 @@ fn standing(status: &BakeStatus) -> String {
         Phase::Merging => format!("{cells}, merging"),
         _ => cells,
     }
-}
-
-/// Until Ctrl-C or SIGTERM. The second one ends the process at once.
-pub async fn stop_signal() {
-    let first = next_signal().await;
-    if first {
-        tokio::spawn(async {
-            if next_signal().await {
-                std::process::exit(i32::from(Kind::Interrupted.exit_code()));
-            }
-        });
-    } else {
-        // No handler could be set: the default action ends the process.
-        std::future::pending::<()>().await;
-    }
-}
-
-async fn next_signal() -> bool {
-    #[cfg(unix)]
-    {
-        use tokio::signal::unix::{SignalKind, signal};
-        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
-            return tokio::select! {
-                _ = terminate.recv() => true,
-                interrupted = tokio::signal::ctrl_c() => interrupted.is_ok(),
-            };
-        }
-    }
-    tokio::signal::ctrl_c().await.is_ok()
 }
 
 impl Baked {

@@ -7,9 +7,9 @@ use serde_json::{Value, json};
 use sightline_jobs::{BakeStatus, Done, LeaseStatus, Phase, TaskId};
 use sightline_proto::access::Role;
 use sightline_proto::v1;
+use sightline_telemetry::stop::signalled;
 use sightline_worker::security::Client;
 
-use super::bake::stop_signal;
 use super::stored::Stored;
 use crate::arguments::Status as Command;
 use crate::failure::{Failure, Kind, Result};
@@ -82,7 +82,7 @@ fn failure(url: &str, status: &tonic::Status) -> Failure {
 /// Follows a bake to its end. On a terminal it stays in place.
 async fn watch(client: Client, command: &Command, is_live: bool) -> Result<()> {
     let mut screen = Screen::default();
-    let mut stop = std::pin::pin!(stop_signal());
+    let mut stop = std::pin::pin!(signalled());
     let mut last: Option<BakeStatus> = None;
     let mut failed = 0;
     while last.as_ref().is_none_or(|status| !status.phase.is_final()) {
@@ -175,7 +175,7 @@ fn json_of(status: &BakeStatus) -> Value {
     value["units"] = json!(units(status));
     value["seconds_left"] = json!(seconds_left(status));
     let stragglers: Vec<TaskId> =
-        status.leases.iter().filter(|l| l.is_straggler()).map(|l| l.task).collect();
+        status.leases.iter().filter(|l| l.is_overdue).map(|l| l.task).collect();
     value["stragglers"] = json!(stragglers);
     value
 }
@@ -256,18 +256,18 @@ fn worker_lines(status: &BakeStatus) -> Vec<String> {
 /// Stragglers first, then the oldest.
 fn lease_lines(status: &BakeStatus) -> Vec<String> {
     let mut leases: Vec<&LeaseStatus> = status.leases.iter().collect();
-    leases.sort_by_key(|l| (!l.is_straggler(), std::cmp::Reverse(l.age_ms), l.lease));
+    leases.sort_by_key(|l| (!l.is_overdue, std::cmp::Reverse(l.age_ms), l.lease));
     leases
         .iter()
         .map(|l| {
             let age = duration(l.age_ms as f64 / 1e3);
-            let usual = match l.usual_ms {
+            let predicted = match l.predicted_ms {
                 0 => String::new(),
-                usual => format!(" (usual {})", duration(usual as f64 / 1e3)),
+                ms => format!(" of {}", duration(ms as f64 / 1e3)),
             };
-            let mark = if l.is_straggler() { ", STRAGGLING" } else { "" };
+            let mark = if l.is_overdue { ", STRAGGLING" } else { "" };
             let who = format!("{} {}", l.worker, l.worker_name);
-            format!("task {}, attempt {}, worker {who}: {age}{usual}{mark}", l.task, l.attempt)
+            format!("task {}, attempt {}, worker {who}: {age}{predicted}{mark}", l.task, l.attempt)
         })
         .collect()
 }
@@ -311,7 +311,8 @@ mod tests {
             worker_name: "far".into(),
             attempt: 2,
             age_ms,
-            usual_ms: 4_000,
+            predicted_ms: 4_000,
+            is_overdue: age_ms > 20_000,
         }
     }
 
@@ -358,14 +359,14 @@ mod tests {
             "2.0 units/s, about 1 min 15 s left",
             "workers  300",
             "and 299 more",
-            "task 4, attempt 2, worker 1 far: 1 min 00 s (usual 4.00 s), STRAGGLING",
+            "task 4, attempt 2, worker 1 far: 1 min 00 s of 4.00 s, STRAGGLING",
             "task 4: 2 attempts",
             "1 quarantined",
             "task 9:",
         ] {
             assert!(text.contains(part), "{part}: {text}");
         }
-        assert!(!text.contains("(usual 4.00 s)\n  task 4"), "stragglers come first: {text}");
+        assert!(!text.contains("of 4.00 s\n  task 4"), "stragglers come first: {text}");
         assert!(!text.contains('\u{1b}'), "reasons do not reach the terminal as they are");
     }
 

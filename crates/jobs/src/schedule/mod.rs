@@ -81,6 +81,9 @@ pub enum FailureClass {
 }
 
 impl FailureClass {
+    /// Every class.
+    pub const ALL: [Self; 3] = [Self::RetryElsewhere, Self::RetryLater, Self::Never];
+
     /// The name, for metrics.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -436,7 +439,7 @@ impl Scheduler {
         self.end_pauses(now_ms);
         let late = self.running.iter().filter(|(_, leases)| leases.len() == 1);
         self.overdue = late
-            .filter(|(task, leases)| self.lateness_ms(**task, leases[0], now_ms).is_some())
+            .filter(|(_, leases)| self.lateness_ms(&self.leases[&leases[0]], now_ms).is_some())
             .map(|(task, _)| *task)
             .collect();
         lost
@@ -523,10 +526,10 @@ impl Scheduler {
         self.costs.predicted_ms(record.kind.into(), record.units)
     }
 
-    /// True when the task's only attempt was overdue at the last look.
+    /// True when the attempt runs so long that its task may get a second one.
     #[must_use]
-    pub fn is_overdue(&self, task: TaskId) -> bool {
-        self.overdue.contains(&task)
+    pub fn is_overdue(&self, lease: &Lease, now_ms: u64) -> bool {
+        self.lateness_ms(lease, now_ms).is_some()
     }
 
     /// True when a worker that asks may get a task that it could not get before the last look: a pause
@@ -586,13 +589,27 @@ impl Scheduler {
     /// Tasks that will not be done as things are. Takes as long as there are tasks in trouble.
     #[must_use]
     pub fn missing(&self) -> Missing {
+        Missing { quarantined: self.quarantined().collect(), blocked: self.blocked() }
+    }
+
+    /// Quarantined tasks, with their reasons.
+    pub fn quarantined(&self) -> impl Iterator<Item = (TaskId, String)> {
+        self.quarantined_tasks().map(|task| (task, self.reason_of(task)))
+    }
+
+    fn quarantined_tasks(&self) -> impl Iterator<Item = TaskId> {
+        let is_out = |task: &TaskId| *self.state(*task) == TaskState::Quarantined;
+        self.troubles.keys().copied().filter(is_out)
+    }
+
+    /// Tasks that depend on quarantined ones, directly or through others.
+    #[must_use]
+    pub fn blocked(&self) -> Vec<TaskId> {
         if self.progress.quarantined == 0 {
-            return Missing::default();
+            return Vec::new();
         }
-        let is_out = |task: &&TaskId| *self.state(**task) == TaskState::Quarantined;
-        let out: Vec<TaskId> = self.troubles.keys().filter(is_out).copied().collect();
         let mut blocked = BTreeSet::new();
-        let mut open = out.clone();
+        let mut open: Vec<TaskId> = self.quarantined_tasks().collect();
         while let Some(task) = open.pop() {
             for dependent in self.dependents.of(task) {
                 let waits = matches!(self.state(*dependent), TaskState::Waiting { .. });
@@ -601,8 +618,7 @@ impl Scheduler {
                 }
             }
         }
-        let quarantined = out.into_iter().map(|task| (task, self.reason_of(task))).collect();
-        Missing { quarantined, blocked: blocked.into_iter().collect() }
+        blocked.into_iter().collect()
     }
 
     /// Panics with the first invariant that does not hold.
@@ -677,19 +693,19 @@ impl Scheduler {
             let first = &self.leases[&self.running[*task][0]];
             first.worker != worker && self.may_try(worker, **task)
         };
-        let late = |task: &TaskId| self.lateness_ms(*task, self.running[task][0], now_ms);
+        let late = |task: &TaskId| self.lateness_ms(&self.leases[&self.running[task][0]], now_ms);
         let late = self.overdue.iter().filter(may).filter_map(|task| Some((late(task)?, *task)));
         late.max_by_key(|(late_ms, task)| (*late_ms, std::cmp::Reverse(*task))).map(|(_, t)| t)
     }
 
     /// How far an attempt is behind the time at which it is overdue, ms; `None` before.
-    fn lateness_ms(&self, task: TaskId, lease: LeaseId, now_ms: u64) -> Option<u64> {
+    fn lateness_ms(&self, lease: &Lease, now_ms: u64) -> Option<u64> {
         let policy = &self.policy;
         let limit_ms =
-            self.predicted_ms(task).map_or(policy.straggler_ms_unknown, |predicted_ms| {
+            self.predicted_ms(lease.task).map_or(policy.straggler_ms_unknown, |predicted_ms| {
                 predicted_ms.saturating_mul(policy.straggler_percent) / 100
             });
-        let ran_ms = now_ms.saturating_sub(self.leases[&lease].since_ms);
+        let ran_ms = now_ms.saturating_sub(lease.since_ms);
         ran_ms.checked_sub(limit_ms.max(policy.straggler_ms_min))
     }
 

@@ -35,7 +35,6 @@ mod file;
 mod folder;
 mod keeper;
 mod map;
-mod size;
 
 use std::{io, path::PathBuf, sync::Arc};
 
@@ -43,7 +42,6 @@ pub(crate) use file::{StoredBody, key, read_or_make};
 pub use folder::default_folder;
 pub use keeper::{Held, Keeper};
 pub(crate) use map::Map;
-pub use size::{ByteSize, SizeError};
 
 use crate::{Cause, SceneError};
 
