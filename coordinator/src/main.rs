@@ -122,7 +122,7 @@ async fn run(arguments: Arguments) -> Result<(), Error> {
     let ended = async { status.wait_for(|s| s.phase.is_final()).await.map(drop) };
     tokio::select! {
         _ = ended => {}
-        () = stop::signalled() => coordinator.shutdown(),
+        () = stop::signalled(|| std::process::exit(stop::INTERRUPTED)) => coordinator.shutdown(),
     }
     let summary = coordinator.join().await?;
     tracing::info!(

@@ -91,7 +91,8 @@ async fn run(arguments: Arguments) -> Result<(), Error> {
         Some(address) => Some(Listener::start(address, registry).await?),
         None => None,
     };
-    let summary = Worker::run(options, stop::signalled()).await?;
+    let summary =
+        Worker::run(options, stop::signalled(|| std::process::exit(stop::INTERRUPTED))).await?;
     let solve_ms = u64::try_from(summary.solve_time.as_millis()).unwrap_or(u64::MAX);
     tracing::info!(
         tasks = summary.tasks,

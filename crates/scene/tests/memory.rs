@@ -130,7 +130,7 @@ fn a_scene_that_cannot_fit_is_refused() {
     options.memory = Some(MemoryLimit::new(1 << 20, folder.path().into()));
     let error = Scene::open(&path, &options).unwrap_err();
     assert!(matches!(*error.cause, Cause::OutOfMemory { limit: 1_048_576, .. }), "{error}");
-    assert!(error.to_string().contains("1 MiB"), "{error}");
+    assert!(error.to_string().contains("1.0 MiB"), "{error}");
     assert!(error.help().is_some());
 }
 

@@ -9,15 +9,16 @@ use crate::{LogOptions, Telemetry};
 pub const INTERRUPTED: i32 = 130;
 
 /// Until someone asks the process to stop: SIGTERM, as container platforms and service managers
-/// send it, or Ctrl-C. Asked once more, the process ends at once, with [`INTERRUPTED`].
-pub async fn signalled() {
+/// send it, or Ctrl-C. `asked_again` is called at the next time: to end the process at once, with
+/// [`INTERRUPTED`].
+pub async fn signalled(asked_again: impl FnOnce() + Send + 'static) {
     if !next_signal().await {
         // No handler could be set: the default action ends the process.
         std::future::pending::<()>().await;
     }
     tokio::spawn(async {
         if next_signal().await {
-            std::process::exit(INTERRUPTED);
+            asked_again();
         }
     });
 }

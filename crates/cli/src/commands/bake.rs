@@ -14,13 +14,12 @@ use sightline_coordinator::{
 use sightline_jobs::{BakeConfig, BakeStatus, Done, Phase, Plan};
 use sightline_scene::{Keeper, SceneDigest};
 use sightline_store::{BakeStore, Dataset, StoreError, keys};
-use sightline_telemetry::stop::signalled;
 use sightline_worker::{Worker, WorkerOptions};
 use tokio::sync::oneshot;
 
-use super::Joining;
 use super::changes::{Before, since_last_bake};
 use super::dataset::Summary;
+use super::{Joining, signalled};
 use crate::arguments::{Bake, BakeInput};
 use crate::failure::{Failure, Kind, Result};
 use crate::memory::{Phases, add_held, held_json};

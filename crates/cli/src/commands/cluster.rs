@@ -10,10 +10,10 @@ use sightline_coordinator::{Coordinator, CoordinatorOptions, Prepared, share_sce
 use sightline_store::{BakeStore, redacted};
 use sightline_telemetry::WatchFlags;
 use sightline_telemetry::metrics::{Listener, Registry};
-use sightline_telemetry::stop::signalled;
 use sightline_worker::{Worker, WorkerOptions};
 
 use super::bake::{open_store, prepare_on, read_config, watch};
+use super::signalled;
 use crate::arguments::{Coordinator as CoordinatorCommand, Worker as WorkerCommand};
 use crate::failure::{Failure, Kind, Result};
 use crate::memory::add_held;

@@ -16,6 +16,12 @@ mod status;
 mod stored;
 mod verify;
 
+/// Until someone asks the command to stop; asked again, it ends at once.
+async fn signalled() {
+    let code = i32::from(crate::failure::Kind::Interrupted.exit_code());
+    sightline_telemetry::stop::signalled(move || std::process::exit(code)).await;
+}
+
 pub use joining::Joining;
 pub use k8s::K8s;
 

@@ -7,9 +7,9 @@ use serde_json::{Value, json};
 use sightline_jobs::{BakeStatus, Done, LeaseStatus, Phase, TaskId};
 use sightline_proto::access::Role;
 use sightline_proto::v1;
-use sightline_telemetry::stop::signalled;
 use sightline_worker::security::Client;
 
+use super::signalled;
 use super::stored::Stored;
 use crate::arguments::Status as Command;
 use crate::failure::{Failure, Kind, Result};
