@@ -5,8 +5,12 @@ use std::{env, error::Error, fs, path::Path};
 use prost::Message;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let files =
-        ["sightline/v1/plan.proto", "sightline/v1/coordinator.proto", "keda/externalscaler.proto"];
+    let files = [
+        "sightline/v1/plan.proto",
+        "sightline/v1/coordinator.proto",
+        "sightline/v1/reuse.proto",
+        "keda/externalscaler.proto",
+    ];
     let descriptors = protox::compile(files, ["."])?;
     let out = env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?;
     fs::write(Path::new(&out).join("descriptors.bin"), descriptors.encode_to_vec())?;

@@ -508,7 +508,9 @@ impl Run {
                 "a lease ran out"
             );
             if self.shared.journal.commit(lease.task).await?.is_some() {
-                self.shared.change(|state, now_ms| state.committed(lease.task, None, now_ms));
+                self.shared.change(|state, now_ms| {
+                    state.committed(lease.task, None, now_ms);
+                });
             }
         }
         let has_work = self.shared.state().has_work();

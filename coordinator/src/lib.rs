@@ -5,6 +5,7 @@
 //! - [`journal`]: what is in the store, who may write it, and what a crash leaves behind.
 //! - [`scene_files`]: scenes from object stores, and copies for workers.
 //! - [`security`]: who may talk to it; [`metrics`]: what it counts.
+//! - [`edit`]: what a bake can take over from an earlier one.
 //! - [`dataset`]: from committed parts to a published dataset.
 //! - [`health`]: the health service on a port of its own, for probes.
 //!
@@ -16,6 +17,7 @@ mod accept;
 pub mod clock;
 mod coordinator;
 pub mod dataset;
+pub mod edit;
 mod error;
 pub mod health;
 pub mod journal;

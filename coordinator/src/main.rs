@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::Parser;
+use sightline_coordinator::edit;
 use sightline_coordinator::health::Health;
 use sightline_coordinator::{
     Coordinator, CoordinatorOptions, Prepared, SecurityFlags, ShareScene, fetch_scene,
@@ -99,10 +100,19 @@ async fn run(arguments: Arguments) -> Result<(), Error> {
         None => scene.display().to_string(),
     };
     let path = scene.clone();
-    let Prepared { plan, publisher, scene: _ } =
+    let Prepared { plan, publisher, content, scene: _ } =
         tokio::task::spawn_blocking(move || prepare_from(&path, &uri, config, None)).await??;
     share_scene(&store, &plan.scene, &scene, &plan.config, arguments.share_scene).await?;
     drop(fetched);
+    if let Some(common) = edit::compare(&store, &plan, content.as_ref()).await? {
+        let edit::Common { bake, objects, same } = common;
+        tracing::info!(
+            bake,
+            objects,
+            same,
+            "what did not change is taken over from an earlier bake"
+        );
+    }
 
     let mut options = CoordinatorOptions::new(arguments.listen, store, plan, Arc::new(publisher));
     options.policy.lease_ms = arguments.lease_ms;

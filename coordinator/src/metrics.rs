@@ -32,6 +32,7 @@ pub struct Metrics {
     tasks_planned: Count,
     units_planned: Family<Label, Real>,
     units_committed: Family<Label, Real>,
+    units_reused: Family<Label, Real>,
     units_per_second: Real,
     tasks_blocked: Count,
     leases: Count,
@@ -57,6 +58,7 @@ impl Default for Metrics {
             tasks_planned: Count::default(),
             units_planned: Family::default(),
             units_committed: Family::default(),
+            units_reused: Family::default(),
             units_per_second: Real::default(),
             tasks_blocked: Count::default(),
             leases: Count::default(),
@@ -103,6 +105,11 @@ impl Metrics {
             "sightline_units_committed",
             "Segments, cells and joins that are committed",
             self.units_committed.clone(),
+        );
+        r.register(
+            "sightline_units_reused",
+            "Segments and cells that were taken over from an earlier bake",
+            self.units_reused.clone(),
         );
         r.register(
             "sightline_units_per_second",
@@ -160,6 +167,10 @@ impl Metrics {
         for (kind, done) in kinds {
             self.units_planned.get_or_create(&[("kind", kind)]).set(done.total as f64);
             self.units_committed.get_or_create(&[("kind", kind)]).set(done.done as f64);
+        }
+        for (kind, reused) in [("cells", status.cells_reused), ("segments", status.segments_reused)]
+        {
+            self.units_reused.get_or_create(&[("kind", kind)]).set(reused as f64);
         }
         self.units_per_second.set(status.units_per_second);
         self.leases.set(status.leases_in_force);

@@ -7,7 +7,7 @@ use sightline_jobs::{
     BakeConfig, ConfigError, Heights, Plan, SceneFile, SceneRef, SkippedCells, TiledCell, plan,
 };
 use sightline_scene::region::{self, RegionError, RegionSpec, TiledRegion, tile};
-use sightline_scene::{MemoryLimit, OpenOptions, Scene, SceneError};
+use sightline_scene::{MemoryLimit, OpenOptions, Scene, SceneContent, SceneError};
 use sightline_store::{
     NumberedInstance, NumberedMesh, Numbering, SceneFile as StoredFile, SceneObject, SceneSource,
 };
@@ -22,6 +22,8 @@ pub struct Prepared {
     pub plan: Plan,
     /// The last step of the bake.
     pub publisher: DatasetPublisher,
+    /// What the scene is made of, for [`crate::edit::compare`].
+    pub content: Option<SceneContent>,
 }
 
 /// Why there is nothing to bake. All kinds are for the user to fix.
@@ -125,7 +127,8 @@ pub fn prepare_scene(
         skipped = plan.skipped.total(),
         "the bake is planned"
     );
-    Ok(Prepared { scene, plan, publisher })
+    let content = SceneContent::of(&scene);
+    Ok(Prepared { scene, plan, publisher, content })
 }
 
 fn region_spec(config: &BakeConfig) -> RegionSpec {

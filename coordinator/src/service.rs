@@ -130,11 +130,17 @@ impl Service {
     ) -> Result<(), Status> {
         let found = self.0.journal.commit(task).await;
         match found {
-            Ok(Some(_)) => {
-                let kind = self.0.state().plan.task(task).kind;
-                self.0.metrics.committed(&kind, solve_ms);
-                let reported = Reported { worker, lease, solve_ms };
-                self.0.change(|state, now_ms| state.committed(task, Some(&reported), now_ms));
+            Ok(Some(commit)) => {
+                let reported = Reported { worker, lease, solve_ms, reused: commit.reused };
+                let mut is_news = false;
+                self.0.change(|state, now_ms| {
+                    is_news = state.committed(task, Some(&reported), now_ms);
+                });
+                // A report that is sent again counts once.
+                if is_news {
+                    let kind = self.0.state().plan.task(task).kind;
+                    self.0.metrics.committed(&kind, solve_ms);
+                }
                 Ok(())
             }
             Ok(None) => {

@@ -23,6 +23,8 @@ pub(crate) struct Reported {
     pub lease: LeaseId,
     /// Time spent in computing, ms.
     pub solve_ms: u64,
+    /// Segments or cells that were taken over from an earlier bake, as the commit says.
+    pub reused: u32,
 }
 
 /// Why a bake ends.
@@ -46,6 +48,8 @@ pub(crate) struct State {
     merge_ms: u64,
     worker_solve_ms: u64,
     tasks_resumed: u32,
+    /// By kind of task.
+    units_reused: [u64; TaskKind::KINDS],
     units_resumed: u64,
     /// When a worker was last at hand.
     workers_seen_ms: u64,
@@ -77,6 +81,7 @@ impl State {
             merge_ms: 0,
             worker_solve_ms: 0,
             tasks_resumed: 0,
+            units_reused: [0; TaskKind::KINDS],
             units_resumed: 0,
             workers_seen_ms: now_ms,
             manifest: 0,
@@ -215,16 +220,21 @@ impl State {
         self.scheduler.heartbeat(worker, held, now_ms)
     }
 
-    /// A task's commit object exists; `by` tells who reported it.
-    pub fn committed(&mut self, task: TaskId, by: Option<&Reported>, now_ms: u64) {
+    /// A task's commit object exists; `by` tells who reported it. True when that is news.
+    pub fn committed(&mut self, task: TaskId, by: Option<&Reported>, now_ms: u64) -> bool {
         let held = by.filter(|r| self.holds(r.worker, r.lease)).map(|r| r.lease);
         let is_news = self.scheduler.committed(task, held, now_ms);
         if let Some(reported) = by {
             self.worker_solve_ms += reported.solve_ms;
+            if is_news {
+                let kind = self.plan.task(task).kind.index();
+                self.units_reused[kind] += u64::from(reported.reused);
+            }
             if let Some(worker) = self.registered.get_mut(&reported.worker).filter(|_| is_news) {
                 worker.tasks_committed += 1;
             }
         }
+        is_news
     }
 
     pub fn attempt_failed(
@@ -290,6 +300,8 @@ impl State {
             segments,
             joins,
             tasks_resumed: self.tasks_resumed,
+            segments_reused: self.units_reused[0],
+            cells_reused: self.units_reused[1],
             workers: self.worker_statuses(),
             workers_at_hand: u32::try_from(self.registered.len()).unwrap_or(u32::MAX),
             leases: self.lease_statuses(now_ms),

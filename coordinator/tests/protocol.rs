@@ -126,8 +126,12 @@ impl FakeWorker {
             bytes: bytes.len() as u64,
             digest: blake3::hash(&bytes).to_hex().to_string(),
         };
-        let commit =
-            v1::Commit { task: task.task, attempt: task.attempt.clone(), parts: vec![part] };
+        let commit = v1::Commit {
+            task: task.task,
+            attempt: task.attempt.clone(),
+            parts: vec![part],
+            reused: 0,
+        };
         let key = keys::commit(bake, task.task);
         self.store.create(&key, commit.encode_to_vec()).await.unwrap()
     }

@@ -10,6 +10,7 @@ pub mod conformance;
 pub mod dataset;
 pub mod flaky_proxy;
 pub mod fuzzing;
+pub mod glb;
 pub mod job;
 pub mod manifests;
 pub mod pods;

@@ -14,7 +14,7 @@ use sightline_geometry::{CellId, PrimitiveId};
 use sightline_scene::{OpenOptions, Scene};
 use sightline_store::{BakeStore, CellRow, Dataset};
 use sightline_tests::binaries::sightline;
-use sightline_tests::{process, scenes};
+use sightline_tests::{dataset, glb, process, scenes};
 
 /// Longest time for one command.
 const LIMIT: Duration = Duration::from_secs(600);
@@ -44,6 +44,10 @@ const ANIMATED: [&str; 12] = [
     "animated/SimpleSkin/glTF/SimpleSkin.gltf",
     "animated/SimpleSparseAccessor/glTF/SimpleSparseAccessor.gltf",
 ];
+
+/// A building of Linz of 14 m, 20 m beyond the western edge of the region that is baked before and after
+/// it moves.
+const MOVED: &str = "ID_50816";
 
 /// A room on the lowest floor, below its ceiling.
 const WARD: [&str; 4] =
@@ -293,4 +297,23 @@ fn hospital_and_its_gpu_instanced_twin_see_the_same_triangles() {
         "{} of {cells} cells differ: {differences:#?}",
         differences.len()
     );
+}
+
+#[test]
+fn a_moved_building_of_linz_costs_the_cells_that_see_it() {
+    let test = "a_moved_building_of_linz_costs_the_cells_that_see_it";
+    let Some(scene) = scenes::shared(test, LINZ) else { return };
+    let flags = ["--region=-100,-100,0,0", "--ground=ground_derived*"];
+    alone(|| {
+        let (over, before) = bake("linz_edited", &scene, &flags);
+        let moved = over.with_file_name("linz_moved.glb");
+        glb::move_node(&scene, &moved, glb::node_named(&scene, MOVED), [3.0, 0.0, 0.0]);
+        let mut again = sightline(["bake", "--json", "--out"]);
+        let again = process::run(again.arg(&over).args(flags).arg(&moved), LIMIT).success().json();
+        let (cells, reused) = (number(&before["cells"]), number(&again["cells_reused"]));
+        assert!(cells >= 100.0 && reused < cells, "some cell sees it: {again:#}");
+        assert!(cells - reused < 0.2 * cells, "{again:#}");
+        let (scratch, _) = bake("linz_scratch", &moved, &flags);
+        dataset::assert_same_published(&scratch, &over);
+    });
 }

@@ -6,26 +6,29 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
 use prost::Message;
-use sightline_geometry::{SegmentId, Timeline, Units};
-use sightline_jobs::{Plan, TaskId, TaskKind};
+use sightline_geometry::{SegmentId, Timeline, Units, ViewSegment};
+use sightline_jobs::{Plan, PlannedCell, TaskId, TaskKind};
 use sightline_proto::v1;
 use sightline_scene::Scene;
 use sightline_store::{
-    BakeStore, CellRow, Created, PartKind, SegmentRow, decode_cell_part, decode_segment_part_where,
-    encode_cell_part, encode_object_part, encode_segment_part, keys,
+    BakeStore, CellRow, Created, PartKind, SegmentRow, StoreError, decode_cell_part,
+    decode_segment_part_where, encode_cell_part, encode_object_part, encode_segment_part, keys,
 };
 use tracing::Instrument;
 
 use crate::cache::PartCache;
-use crate::compute::{Compute, Computed, Part};
+use crate::compute::{Compute, Computed, Output, Part};
 use crate::error::AttemptError;
 use crate::pool::Cancel;
-use crate::solve::{self, CellOutput, Work};
+use crate::reuse::{Earlier, Reuse};
+use crate::solve::{self, CellOutput, SegmentOutput, Work};
+use crate::trace::Traces;
 
 /// What all attempts at the tasks of one bake share.
 pub(crate) struct Bake {
@@ -34,6 +37,8 @@ pub(crate) struct Bake {
     timeline: Timeline,
     units: Units,
     pub scene: Arc<Scene>,
+    /// What may be taken over from an earlier bake.
+    reuse: Option<Reuse>,
     compute: Arc<dyn Compute>,
     cache: Mutex<PartCache>,
 }
@@ -49,10 +54,17 @@ enum Inputs {
 }
 
 impl Bake {
-    pub fn new(store: BakeStore, plan: Plan, scene: Arc<Scene>, compute: Arc<dyn Compute>) -> Self {
+    /// Reads what it needs of an earlier bake.
+    pub async fn open(
+        store: BakeStore,
+        plan: Plan,
+        scene: Arc<Scene>,
+        compute: Arc<dyn Compute>,
+    ) -> Result<Self, StoreError> {
         let timeline = plan.timeline();
         let units = Units::new(&scene.geometry, plan.config.solver.granularity);
-        Self { store, plan, timeline, units, scene, compute, cache: Mutex::default() }
+        let reuse = Reuse::open(&store, &plan.bake_id, &scene).await?;
+        Ok(Self { store, plan, timeline, units, scene, reuse, compute, cache: Mutex::default() })
     }
 
     /// Attempts a task; on success its commit exists. Gives the time spent in computing.
@@ -62,20 +74,25 @@ impl Bake {
         attempt: &str,
         cancel: &Cancel,
     ) -> Result<Duration, AttemptError> {
-        let inputs = self.read(task).instrument(tracing::info_span!("read")).await?;
+        let read = async {
+            Ok::<_, AttemptError>((self.read(task).await?, self.read_earlier(task).await?))
+        };
+        let (inputs, earlier) = read.instrument(tracing::info_span!("read")).await?;
         let (bake, cancelled) = (Arc::clone(self), cancel.clone());
         let span = tracing::info_span!("solve");
         let job = Box::new(move || {
             let _solving = span.enter();
-            bake.compute(task, &inputs, &cancelled)
+            bake.compute(task, &inputs, &earlier, &cancelled)
         });
-        let Computed { parts, took } = self.compute.compute(task, job).await?;
+        let Computed { output, took } = self.compute.compute(task, job).await?;
         if cancel.is_cancelled() {
             return Err(AttemptError::GivenUp);
         }
         let write = tracing::info_span!("write");
-        let parts = self.write_parts(task, attempt, parts).instrument(write).await?;
-        self.commit(task, attempt, parts).instrument(tracing::info_span!("commit")).await?;
+        let parts = self.write_parts(task, attempt, output.parts).instrument(write).await?;
+        let commit =
+            v1::Commit { task: task.0, attempt: attempt.to_owned(), parts, reused: output.reused };
+        self.commit(&commit).instrument(tracing::info_span!("commit")).await?;
         Ok(took)
     }
 
@@ -87,37 +104,55 @@ impl Bake {
         })
     }
 
-    /// Solves and encodes. Runs on the solving threads.
+    /// What an earlier bake has for a task.
+    async fn read_earlier(&self, task: TaskId) -> Result<Earlier, AttemptError> {
+        let (Some(reuse), plan) = (&self.reuse, &self.plan) else { return Ok(Earlier::default()) };
+        Ok(match plan.task(task).kind {
+            TaskKind::Segments { .. } => {
+                reuse.read(plan.segments_of(task), &[], &plan.segments).await?
+            }
+            TaskKind::Cells { .. } => reuse.read(&[], plan.cells_of(task), &plan.segments).await?,
+            TaskKind::Join { .. } => Earlier::default(),
+        })
+    }
+
+    /// Takes over or solves, and encodes. Runs on the solving threads.
     fn compute(
         &self,
         task: TaskId,
         inputs: &Inputs,
+        earlier: &Earlier,
         cancel: &Cancel,
-    ) -> Result<Vec<Part>, AttemptError> {
+    ) -> Result<Output, AttemptError> {
         let Self { plan, scene, timeline, units, .. } = self;
         let states = plan.states_of(task);
         let work = Work { scene, timeline, config: &plan.config, units, states };
+        let reused = AtomicU32::new(0);
+        let count = || _ = reused.fetch_add(1, Ordering::Relaxed);
         let solved = match inputs {
             Inputs::Nothing => {
+                let reuse = |segment: &ViewSegment| {
+                    let reuse = self.reuse.as_ref()?;
+                    reuse.segment(scene, earlier, segment).inspect(|_| count())
+                };
                 let segments = plan.segments_of(task);
-                let solved =
-                    solve::solve_segments(&work, segments, cancel).ok_or(AttemptError::GivenUp)?;
-                return Ok(vec![(PartKind::Segments, encode_segment_part(&solved)?)]);
+                let solved = solve::solve_segments(&work, segments, reuse, cancel);
+                let solved = solved.ok_or(AttemptError::GivenUp)?;
+                return Ok(Output { parts: segment_parts(solved)?, reused: reused.into_inner() });
             }
             Inputs::Segments(rows) => {
+                let reuse = |cell: &PlannedCell| {
+                    let reuse = self.reuse.as_ref()?;
+                    reuse.cell(scene, earlier, cell, rows).inspect(|_| count())
+                };
                 let cells = plan.cells_of(task);
-                solve::solve_cells(&work, cells, &plan.segments, rows, cancel)
+                solve::solve_cells(&work, cells, &plan.segments, rows, reuse, cancel)
                     .ok_or(AttemptError::GivenUp)?
             }
             Inputs::Ranges(ranges) => solve::join_cells(scene, timeline, ranges),
         };
-        let (cells, objects): (Vec<_>, Vec<_>) =
-            solved.into_iter().map(|CellOutput { rows, objects }| (rows, objects)).unzip();
-        let mut parts = vec![(PartKind::Cells, encode_cell_part(&cells.concat())?)];
-        if work.takes_all_states() {
-            parts.push((PartKind::Objects, encode_object_part(&objects.concat())?));
-        }
-        Ok(parts)
+        let parts = cell_parts(solved, work.takes_all_states())?;
+        Ok(Output { parts, reused: reused.into_inner() })
     }
 
     /// Step 1 of an attempt: the parts.
@@ -148,16 +183,11 @@ impl Bake {
     }
 
     /// Step 2: the commit.
-    async fn commit(
-        &self,
-        task: TaskId,
-        attempt: &str,
-        parts: Vec<v1::CommittedPart>,
-    ) -> Result<(), AttemptError> {
-        let commit = v1::Commit { task: task.0, attempt: attempt.to_owned(), parts };
-        let key = keys::commit(&self.plan.bake_id, task.0);
+    async fn commit(&self, commit: &v1::Commit) -> Result<(), AttemptError> {
+        let key = keys::commit(&self.plan.bake_id, commit.task);
         if self.store.create(&key, commit.encode_to_vec()).await? == Created::AlreadyThere {
-            tracing::info!(task = task.0, attempt, "another attempt committed first");
+            let v1::Commit { task, attempt, .. } = commit;
+            tracing::info!(task, attempt, "another attempt committed first");
         }
         Ok(())
     }
@@ -251,6 +281,46 @@ impl Bake {
     fn cache(&self) -> std::sync::MutexGuard<'_, PartCache> {
         // A panic while the cache is held leaves at worst a part too few in it.
         self.cache.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The parts of a segments task.
+fn segment_parts(solved: Vec<SegmentOutput>) -> Result<Vec<Part>, AttemptError> {
+    let mut traces = Traces::default();
+    let mut rows = Vec::with_capacity(solved.len());
+    for found in solved {
+        if let (Some(trace), Some(row)) = (found.trace, found.rows.first()) {
+            traces.segments.insert(row.segment, trace);
+        }
+        rows.extend(found.rows);
+    }
+    let mut parts = vec![(PartKind::Segments, encode_segment_part(&rows)?)];
+    add_traces(&mut parts, &traces);
+    Ok(parts)
+}
+
+/// The parts of a cells or a join task.
+fn cell_parts(solved: Vec<CellOutput>, has_all_states: bool) -> Result<Vec<Part>, AttemptError> {
+    let mut traces = Traces::default();
+    let (mut rows, mut objects) = (Vec::new(), Vec::new());
+    for found in solved {
+        if let (Some(trace), Some(row)) = (found.trace, found.rows.first()) {
+            traces.cells.insert(row.cell.id, trace);
+        }
+        rows.extend(found.rows);
+        objects.extend(found.objects);
+    }
+    let mut parts = vec![(PartKind::Cells, encode_cell_part(&rows)?)];
+    if has_all_states {
+        parts.push((PartKind::Objects, encode_object_part(&objects)?));
+    }
+    add_traces(&mut parts, &traces);
+    Ok(parts)
+}
+
+fn add_traces(parts: &mut Vec<Part>, traces: &Traces) {
+    if !traces.segments.is_empty() || !traces.cells.is_empty() {
+        parts.push((PartKind::Traces, traces.encode()));
     }
 }
 

@@ -37,7 +37,8 @@ use std::ops::Range;
 use glam::DVec3;
 use rayon::prelude::*;
 use sightline_geometry::{
-    Sampling, SegmentId, StateSets, ViewCell, ViewSegment, overlap::primitives_in_cell_over,
+    PrimitiveId, PrimitiveSet, Sampling, SegmentId, StateSets, ViewCell, ViewSegment,
+    overlap::primitives_in_cell_over,
 };
 use sightline_jobs::PlannedCell;
 use sightline_quality::{
@@ -49,6 +50,7 @@ use sightline_store::{CellEffort, CellRow, SegmentRow};
 
 use crate::join::join_cell;
 use crate::solve::{CellOutput, Work, planned_path, sets_of, solve_segment};
+use crate::trace::{CellTrace, ExtraTrace};
 use crate::weights::{CellWeights, Seen, object_rows};
 
 /// Base of the seeds of held-out viewpoints ("sightline" on a keypad); the round is added. Far
@@ -91,6 +93,7 @@ struct Extra {
     segment: ViewSegment,
     /// By runs of the states in which it was solved.
     rows: Vec<SegmentRow>,
+    trace: Option<ExtraTrace>,
 }
 
 /// What one measurement found.
@@ -133,6 +136,10 @@ struct Sight<'a> {
     solver_rays: u64,
     skipped_movers: u64,
     heldout_rays: u64,
+    /// What was measured so far.
+    asked: CellTrace,
+    /// What the set lacked of what rays met.
+    missed: Vec<PrimitiveId>,
 }
 
 impl Sight<'_> {
@@ -148,14 +155,19 @@ impl Sight<'_> {
         let seed = self.seed(HELDOUT_SEED, round);
         let mut test = ErrorTest::new(config.accuracy.target_error, round);
         let mut wrong: Vec<Suspect> = Vec::new();
+        let (mut missing, mut batches) = (Vec::new(), 0);
         for batch in 0.. {
             let found = measure_scattered_over(geometry, &members, timeline, cell, batch, seed);
-            test.add(u64::from(SCATTERED_BATCH), found.len() as u64);
-            wrong.extend(found);
+            test.add(u64::from(SCATTERED_BATCH), found.wrong.len() as u64);
+            wrong.extend(found.wrong);
+            missing.extend(found.missing);
+            batches += 1;
             if test.verdict() != Verdict::Open {
                 break;
             }
         }
+        self.asked.batches.push((seed, batches));
+        self.missed.append(&mut missing);
         let heights = wrong.iter().map(|w| relative_height(cell, w.viewpoint)).collect();
         let times = wrong.iter().map(|w| w.moment.t).collect();
         let states = || wrong.iter().map(|w| w.moment.state);
@@ -181,9 +193,11 @@ impl Sight<'_> {
     fn errors_at(&mut self, at: &[Suspect], seed: u64) -> Vec<f64> {
         self.heldout_rays += u64::from(SUSPECT_RAYS) * at.len() as u64;
         let (geometry, id) = (&self.work.scene.geometry, self.cell.id);
-        let found =
-            measure_viewpoints_at(geometry, &self.sets, id, at, SUSPECT_RAYS, seed).viewpoints;
-        found.iter().map(|v| v.error).collect()
+        let found = measure_viewpoints_at(geometry, &self.sets, id, at, SUSPECT_RAYS, seed);
+        let asked = found.viewpoints.iter().map(|v| (v.viewpoint, v.seed, v.rays));
+        self.asked.viewpoints.extend(asked);
+        self.missed.extend(found.missing);
+        found.viewpoints.iter().map(|v| v.error).collect()
     }
 
     fn is_good(&self, found: &Finding) -> bool {
@@ -254,7 +268,6 @@ impl Sight<'_> {
     /// Solves segments of the cell alone in some states, at the rows of the finest run, and finer where
     /// they see what is not known yet.
     fn solve(&mut self, segments: &[(ViewSegment, TimePath)], states: &Range<u32>) {
-        let sampling = Sampling::new(self.rows);
         let first = self.extra.len() as u32;
         let numbered: Vec<(ViewSegment, TimePath)> = (first..)
             .zip(segments)
@@ -268,8 +281,9 @@ impl Sight<'_> {
             .into_par_iter()
             .map(|(segment, path)| {
                 let (states, known) = (states.clone(), Some(&known));
-                let rows = solve_segment(self.work, &segment, sampling, states, path, known);
-                Extra { rows, segment }
+                let found = solve_segment(self.work, &segment, self.rows, states, path, known);
+                let trace = found.trace.map(|trace| ExtraTrace { segment, rows: self.rows, trace });
+                Extra { rows: found.rows, segment, trace }
             })
             .collect();
         for row in seen.iter().flat_map(|e| &e.rows) {
@@ -320,6 +334,8 @@ pub fn finish_cell(
             .map(|row| row.skipped_movers)
             .sum(),
         heldout_rays: 0,
+        asked: CellTrace::default(),
+        missed: Vec::new(),
     };
     drop(seen);
     let mut round = 0;
@@ -338,6 +354,15 @@ pub fn finish_cell(
         .chain(sight.extra.iter().map(|e| (&e.segment, &e.rows[..])))
         .map(|(segment, rows)| Seen { rows, length: (segment.v1 - segment.v0).length() })
         .collect();
+    let trace = work.is_traced().then(|| {
+        let mut missed: Vec<u32> = sight.missed.iter().map(|primitive| primitive.0).collect();
+        missed.sort_unstable();
+        CellTrace {
+            extra: sight.extra.iter().filter_map(|extra| extra.trace.clone()).collect(),
+            missing: PrimitiveSet::from_sorted(missed),
+            ..sight.asked
+        }
+    });
     let effort = CellEffort {
         segments: seen.len() as u32,
         runs: sight.runs,
@@ -374,7 +399,7 @@ pub fn finish_cell(
     if !work.takes_all_states() {
         let mut rows: Vec<CellRow> = rows.into_iter().map(|(row, _)| row).collect();
         rows.sort_by_key(CellRow::order);
-        return CellOutput { rows, objects: Vec::new() };
+        return CellOutput { rows, objects: Vec::new(), trace };
     }
     if rows.len() > 1 {
         let runs: Vec<CellRow> = rows.into_iter().map(|(row, _)| row).collect();
@@ -382,7 +407,7 @@ pub fn finish_cell(
     }
     let (row, weights) = rows.remove(0);
     let objects = object_rows(scene, &row, &weights, std::slice::from_ref(&row));
-    CellOutput { objects, rows: vec![row] }
+    CellOutput { objects, rows: vec![row], trace }
 }
 
 /// The same coupling, seen from the other end of a segment; and the other coupling from the same end.

@@ -13,14 +13,23 @@ use crate::pool::SolvePool;
 /// A part that is ready to be written.
 pub type Part = (PartKind, Bytes);
 
+/// What a task gives.
+#[derive(Clone, Debug, Default)]
+pub struct Output {
+    /// The parts.
+    pub parts: Vec<Part>,
+    /// Segments or cells that were taken over from an earlier bake.
+    pub reused: u32,
+}
+
 /// The computation of a task: from what was read to the parts, a function of the plan and the scene.
-pub type Job = Box<dyn FnOnce() -> Result<Vec<Part>, AttemptError> + Send>;
+pub type Job = Box<dyn FnOnce() -> Result<Output, AttemptError> + Send>;
 
 /// What a computation gave.
 #[derive(Clone, Debug)]
 pub struct Computed {
-    /// The parts.
-    pub parts: Vec<Part>,
+    /// What the task gives.
+    pub output: Output,
     /// Time spent.
     pub took: Duration,
 }
@@ -40,7 +49,7 @@ impl Compute for SolvePool {
     async fn compute(&self, _: TaskId, job: Job) -> Result<Computed, AttemptError> {
         let timed = || {
             let start = Instant::now();
-            job().map(|parts| Computed { parts, took: start.elapsed() })
+            job().map(|output| Computed { output, took: start.elapsed() })
         };
         self.run(timed).await?
     }

@@ -61,7 +61,7 @@ pub(crate) fn join_cell(scene: &Scene, timeline: &Timeline, ranges: &[&[CellRow]
         rows.extend(runs);
         rows.sort_by_key(CellRow::order);
     }
-    CellOutput { rows, objects }
+    CellOutput { rows, objects, trace: None }
 }
 
 /// What a cell's rows in one range of states say together.

@@ -4,6 +4,7 @@
 //! - [`compute`]: where the computation of a task runs.
 //! - [`scene_files`]: the scene on a machine that may not have it.
 //! - [`solve`]: what a task computes; a pure function of scene, plan and the rows it reads.
+//! - [`trace`]: what its results depend on, for a later bake of an edited scene.
 //! - [`security`]: how it shows who it is; [`metrics`]: what it counts.
 //!
 //! Solving runs on a thread pool of its own, never on the runtime that talks to the coordinator,
@@ -19,9 +20,11 @@ mod error;
 mod join;
 pub mod metrics;
 mod pool;
+mod reuse;
 pub mod scene_files;
 pub mod security;
 pub mod solve;
+pub mod trace;
 mod weights;
 mod worker;
 

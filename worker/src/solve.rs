@@ -13,18 +13,19 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 use sightline_geometry::{
-    InstancedGeometry, Sampling, SegmentId, StateSets, Timeline, Units, ViewSegment,
+    Granularity, InstancedGeometry, Sampling, SegmentId, StateSets, Timeline, Units, ViewSegment,
 };
 use sightline_jobs::{BakeConfig, PlannedCell};
 use sightline_scene::Scene;
 use sightline_solver::{
-    SegmentVisibility, SolveOptions, TimePath, solve_segment_with, solve_states,
+    SegmentTrace, SegmentVisibility, SolveOptions, TimePath, solve_segment_with, solve_states,
 };
 use sightline_store::{CellRow, ObjectRow, SegmentRow};
 
 use crate::cell::finish_cell;
 pub use crate::join::join_cells;
 pub use crate::pool::Cancel;
+use crate::trace::CellTrace;
 
 /// What a task works on: some of the states of a scene.
 #[derive(Clone, Debug)]
@@ -42,6 +43,14 @@ pub struct Work<'a> {
 }
 
 impl Work<'_> {
+    /// True when it is known what results depend on: in scenes at rest, of single primitives.
+    #[must_use]
+    pub fn is_traced(&self) -> bool {
+        is_at_rest(&self.scene.geometry)
+            && self.scene.geometry.particles.is_empty()
+            && self.units.granularity() == Granularity::Triangle
+    }
+
     /// True when the task takes all states of the scene.
     #[must_use]
     pub fn takes_all_states(&self) -> bool {
@@ -49,24 +58,47 @@ impl Work<'_> {
     }
 }
 
-/// Solves segments, in order: for each, one row a run of states with equal results. `None` when it was
-/// cancelled.
+/// What was found from one segment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SegmentOutput {
+    /// One row a run of states with equal results.
+    pub rows: Vec<SegmentRow>,
+    /// What that depends on; none where something moves, or where units larger than triangles are looked
+    /// for: what is hidden has a part in when a unit is settled.
+    pub trace: Option<SegmentTrace>,
+}
+
+/// Solves segments, in order, but for what is known already. `None` when it was cancelled.
 #[must_use]
 pub fn solve_segments(
     work: &Work<'_>,
     segments: &[ViewSegment],
+    known: impl Fn(&ViewSegment) -> Option<SegmentOutput> + Sync,
     cancel: &Cancel,
-) -> Option<Vec<SegmentRow>> {
-    let sampling = Sampling::new(work.config.solver.rows);
-    let solved: Option<Vec<Vec<SegmentRow>>> = segments
-        .par_iter()
-        .map(|segment| {
-            let (states, path) = (work.states.clone(), planned_path(segment.id));
-            (!cancel.is_cancelled())
-                .then(|| solve_segment(work, segment, sampling, states, path, None))
-        })
-        .collect();
-    solved.map(|rows| rows.concat())
+) -> Option<Vec<SegmentOutput>> {
+    let solve = |segment: &ViewSegment| {
+        let found = || known(segment).unwrap_or_else(|| solve_planned(work, segment));
+        (!cancel.is_cancelled()).then(found)
+    };
+    segments.par_iter().map(solve).collect()
+}
+
+/// The rays of the first pass of a segment of the plan.
+pub(crate) const fn planned_rows(config: &BakeConfig) -> u32 {
+    config.solver.rows
+}
+
+/// Solves a segment of the plan.
+#[must_use]
+pub fn solve_planned(work: &Work<'_>, segment: &ViewSegment) -> SegmentOutput {
+    let rows = planned_rows(work.config);
+    solve_segment(work, segment, rows, work.states.clone(), planned_path(segment.id), None)
+}
+
+/// The rays of a segment's first pass. Segments differ in where the rays of their pixels are: neighbours
+/// on one line would otherwise share their rows.
+pub(crate) fn rays_of(segment: &ViewSegment, rows: u32) -> Sampling {
+    Sampling::new(rows).jittered(segment.id.0)
 }
 
 /// How camera and time are coupled along a segment of the plan.
@@ -85,20 +117,19 @@ fn is_at_rest(geometry: &InstancedGeometry) -> bool {
     geometry.states == 1 && !geometry.has_motion()
 }
 
-/// The one place that calls the solver. Segments differ in where the rays of their pixels are:
-/// neighbours on one line would otherwise share their rows. Without refinement by rounds, there is
-/// none by rays. What is `known` is so in each of `states`.
+/// The one place that calls the solver. Without refinement by rounds, there is none by rays. What is
+/// `known` is so in each of `states`.
 #[must_use]
-pub fn solve_segment(
+pub(crate) fn solve_segment(
     work: &Work<'_>,
     segment: &ViewSegment,
-    sampling: Sampling,
+    rows: u32,
     states: Range<u32>,
     path: TimePath,
     known: Option<&StateSets>,
-) -> Vec<SegmentRow> {
+) -> SegmentOutput {
     let Work { scene, config, units, .. } = *work;
-    let sampling = sampling.jittered(segment.id.0);
+    let sampling = rays_of(segment, rows);
     let options = SolveOptions {
         passes: if config.accuracy.rounds > 0 { PASSES } else { 0 },
         threshold: TILE_SHARE * config.accuracy.target_error,
@@ -116,13 +147,13 @@ pub fn solve_segment(
     };
     if is_at_rest(&scene.geometry) {
         let options = SolveOptions { known: known.map(|sets| sets.at(states.start)), ..options };
-        let found = solve_segment_with(&scene.geometry, segment, sampling, &options);
-        return vec![row(states, found)];
+        let mut found = solve_segment_with(&scene.geometry, segment, sampling, &options);
+        let trace = work.is_traced().then(|| std::mem::take(&mut found.trace));
+        return SegmentOutput { rows: vec![row(states, found)], trace };
     }
-    solve_states(&scene.geometry, segment, sampling, states, path, known, &options)
-        .into_iter()
-        .map(|found| row(found.states, found.visibility))
-        .collect()
+    let found = solve_states(&scene.geometry, segment, sampling, states, path, known, &options);
+    let rows = found.into_iter().map(|found| row(found.states, found.visibility)).collect();
+    SegmentOutput { rows, trace: None }
 }
 
 /// What rows of one segment see in each of their states.
@@ -142,9 +173,11 @@ pub struct CellOutput {
     /// One row an object of which a primitive is visible, ascending; none when the task does not take
     /// all states.
     pub objects: Vec<ObjectRow>,
+    /// What that depends on; none where its segments have none.
+    pub trace: Option<CellTrace>,
 }
 
-/// Finishes cells, in order. `None` when it was cancelled. `segments` are those of the plan, by
+/// Finishes cells, in order, but for those that are known already. `None` when it was cancelled. `segments` are those of the plan, by
 /// number; `rows` holds at least the rows of the cells' segments in the states of the task.
 ///
 /// # Panics
@@ -155,14 +188,24 @@ pub fn solve_cells(
     cells: &[PlannedCell],
     segments: &[ViewSegment],
     rows: &BTreeMap<SegmentId, Vec<SegmentRow>>,
+    known: impl Fn(&PlannedCell) -> Option<CellOutput> + Sync,
     cancel: &Cancel,
 ) -> Option<Vec<CellOutput>> {
     cells
         .par_iter()
         .map(|planned| {
-            let solved: Vec<(&ViewSegment, &[SegmentRow])> =
-                planned.segments.iter().map(|id| (&segments[id.index()], &rows[id][..])).collect();
-            (!cancel.is_cancelled()).then(|| finish_cell(work, planned, &solved))
+            if cancel.is_cancelled() {
+                return None;
+            }
+            let finish = || {
+                let solved: Vec<(&ViewSegment, &[SegmentRow])> = planned
+                    .segments
+                    .iter()
+                    .map(|id| (&segments[id.index()], &rows[id][..]))
+                    .collect();
+                finish_cell(work, planned, &solved)
+            };
+            Some(known(planned).unwrap_or_else(finish))
         })
         .collect()
 }

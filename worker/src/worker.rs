@@ -255,7 +255,7 @@ impl Life {
         let scene = self.open_scene(session, &plan, &store).await?;
         let pool: Arc<dyn Compute> = Arc::new(self.pool.clone());
         let compute = self.options.compute.clone().unwrap_or(pool);
-        Ok(Arc::new(Bake::new(store, plan, scene, compute)))
+        Ok(Arc::new(Bake::open(store, plan, scene, compute).await?))
     }
 
     async fn open_scene(

@@ -286,10 +286,14 @@ fn finish_all(scene: &Scene, plan: &Plan) -> Vec<CellOutput> {
     for first in (0..all).step_by(a_task as usize) {
         let states = first..all.min(first + a_task);
         let work = Work { scene, timeline: &timeline, config: &plan.config, units, states };
-        let solved = solve_segments(&work, &plan.segments, &never).unwrap();
+        let solved = solve_segments(&work, &plan.segments, |_| None, &never).unwrap();
         let mut rows: BTreeMap<SegmentId, Vec<SegmentRow>> = BTreeMap::new();
-        solved.into_iter().for_each(|row| rows.entry(row.segment).or_default().push(row));
-        let done = solve_cells(&work, &plan.cells, &plan.segments, &rows, &never).unwrap();
+        solved
+            .into_iter()
+            .flat_map(|found| found.rows)
+            .for_each(|row| rows.entry(row.segment).or_default().push(row));
+        let done =
+            solve_cells(&work, &plan.cells, &plan.segments, &rows, |_| None, &never).unwrap();
         if work.takes_all_states() {
             return done;
         }
@@ -301,7 +305,8 @@ fn finish_all(scene: &Scene, plan: &Plan) -> Vec<CellOutput> {
 
 /// One cell of a scene at rest.
 fn finish_one(scene: &Scene, config: BakeConfig) -> (CellRow, Vec<ObjectRow>) {
-    let CellOutput { mut rows, objects } = finish_all(scene, &plan_one(scene, config)).remove(0);
+    let CellOutput { mut rows, objects, .. } =
+        finish_all(scene, &plan_one(scene, config)).remove(0);
     assert_eq!(rows.len(), 1, "a scene at rest has one row a cell");
     assert_eq!(rows[0].states(), 0..1);
     (rows.remove(0), objects)
@@ -471,7 +476,7 @@ fn set(members: &[u32]) -> PrimitiveSet {
 fn what_moves_has_a_row_a_run_of_states_and_one_of_all() {
     let folder = tempfile::tempdir().unwrap();
     let scene = crossing(folder.path());
-    let CellOutput { rows, objects } =
+    let CellOutput { rows, objects, .. } =
         finish_all(&scene, &plan_one(&scene, moving_config(32))).remove(0);
     let found: Vec<_> = rows.iter().map(|row| (row.states(), row.set.clone())).collect();
     // All states first, the longest run next, then by time.

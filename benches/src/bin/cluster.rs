@@ -225,7 +225,7 @@ impl Idle {
         let part = v1::CommittedPart { key: key.clone(), bytes: bytes.len() as u64, digest };
         self.store.create(&key, bytes).await?;
         let (task, attempt) = (leased.task, leased.attempt.clone());
-        let commit = v1::Commit { task, attempt, parts: vec![part] };
+        let commit = v1::Commit { task, attempt, parts: vec![part], reused: 0 };
         self.store.create(&keys::commit(bake, task), commit.encode_to_vec()).await?;
         Ok(())
     }
@@ -277,7 +277,7 @@ async fn restart(store: &BakeStore, tasks: u32) -> Result<(), Error> {
     std::fs::create_dir_all(&folder)?;
     for task in 0..tasks {
         // Not synced: how the commits got there is not what is measured.
-        let commit = v1::Commit { task, attempt: "e1-w1-l1".into(), parts: vec![] };
+        let commit = v1::Commit { task, attempt: "e1-w1-l1".into(), parts: vec![], reused: 0 };
         let key = keys::commit(&plan.bake_id, task);
         std::fs::write(std::path::Path::new(store.location()).join(key), commit.encode_to_vec())?;
     }

@@ -12,7 +12,7 @@
 //! two top-level hierarchies: the first hide what is behind them, the second never do. Those that move
 //! are in two more, whose nodes have a box at each key frame: what rests never pays for motion.
 
-use std::{ops::Range, sync::Arc};
+use std::{collections::BTreeMap, ops::Range, sync::Arc};
 
 use glam::{DAffine3, DVec3};
 
@@ -425,6 +425,24 @@ impl InstancedGeometry {
             residency: None,
             placements,
         }
+    }
+
+    /// A scene of some of its instances alone, numbered anew, at rest; they must be at rest.
+    #[must_use]
+    pub fn of_instances(&self, chosen: impl IntoIterator<Item = InstanceId>) -> Self {
+        let mut new_ids: BTreeMap<MeshId, MeshId> = BTreeMap::new();
+        let (mut meshes, mut instances, mut next) = (Vec::new(), Vec::new(), 0);
+        for id in chosen {
+            let instance = &self.instances[id.index()];
+            let mesh = *new_ids.entry(instance.mesh).or_insert_with(|| {
+                meshes.push(self.meshes[instance.mesh.index()].clone());
+                MeshId(meshes.len() as u32 - 1)
+            });
+            let first_primitive = PrimitiveId(next);
+            next += meshes[mesh.index()].triangles.len() as u32;
+            instances.push(Instance { mesh, first_primitive, motion: None, ..instance.clone() });
+        }
+        Self { residency: self.residency.clone(), ..Self::new(meshes, instances) }
     }
 
     /// To be called by who walks it, after at most [`STEPS`](crate::STEPS) steps.

@@ -134,6 +134,11 @@ pub struct BakeStatus {
     pub joins: Done,
     /// Tasks that were committed before this coordinator started.
     pub tasks_resumed: u32,
+    /// Of the segments and cells that this coordinator saw committed, those that were taken over from an
+    /// earlier bake.
+    pub segments_reused: u64,
+    /// See [`Self::segments_reused`].
+    pub cells_reused: u64,
     /// Workers at hand; at most [`Self::LISTED_MAX`] of them.
     pub workers: Vec<WorkerStatus>,
     /// Number of workers at hand.

@@ -20,6 +20,7 @@
 //! no function of the platform's maths library is used, only operations that IEEE 754 rounds
 //! correctly.
 
+mod affected;
 mod depth_tie;
 mod directions;
 mod measure;
@@ -28,12 +29,15 @@ mod scattered;
 mod seed;
 mod sequential;
 
+pub use affected::Newcomers;
 pub use depth_tie::ties;
 pub use measure::{
     CellError, ViewpointError, measure_cell, measure_cell_over, measure_viewpoint,
     measure_viewpoint_at, measure_viewpoints_at, random_viewpoints,
 };
 pub use membership::{Members, StateMembers};
-pub use scattered::{SCATTERED_BATCH, Suspect, measure_scattered, measure_scattered_over};
+pub use scattered::{
+    SCATTERED_BATCH, Scattered, Suspect, measure_scattered, measure_scattered_over,
+};
 pub use seed::{SplitMix64, viewpoint_seed};
 pub use sequential::{ErrorTest, Verdict};

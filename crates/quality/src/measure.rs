@@ -4,11 +4,13 @@
 //! the order does not matter. Nearly every ray ends at a member of the set after one trace; only
 //! the others are traced again with the members alone.
 
+use std::ops::Range;
+
 use glam::DVec3;
 use rayon::prelude::*;
 use sightline_geometry::raycast::{Hit, Ray, RayCaster};
 use sightline_geometry::{
-    CellId, InstancedGeometry, Moment, PrimitiveSet, StateSets, Timeline, ViewCell,
+    CellId, InstancedGeometry, Moment, PrimitiveId, PrimitiveSet, StateSets, Timeline, ViewCell,
 };
 
 use crate::depth_tie::ties;
@@ -48,6 +50,8 @@ pub struct CellError {
     pub cell: CellId,
     /// One result a viewpoint, in the order of the viewpoints.
     pub viewpoints: Vec<ViewpointError>,
+    /// Primitives that wrong rays met and the sets lack, in a fixed order; some of them often.
+    pub missing: Vec<PrimitiveId>,
 }
 
 impl CellError {
@@ -99,7 +103,7 @@ pub fn measure_viewpoint_at(
     rays: u32,
     seed: u64,
 ) -> ViewpointError {
-    measure(geometry, sets, &[(at, seed)], rays)[0]
+    measure(geometry, sets, &[(at, seed)], rays).0[0]
 }
 
 /// Measures `set` at `viewpoints` random viewpoints, uniform in the cell, of a scene at rest.
@@ -162,7 +166,8 @@ pub fn measure_viewpoints_at(
 ) -> CellError {
     let seeded: Vec<(Suspect, u64)> =
         (0..).zip(at).map(|(i, &at)| (at, viewpoint_seed(seed, cell, i))).collect();
-    CellError { cell, viewpoints: measure(geometry, sets, &seeded, rays) }
+    let (viewpoints, missing) = measure(geometry, sets, &seeded, rays);
+    CellError { cell, viewpoints, missing }
 }
 
 /// `count` viewpoints, uniform in the cell's footprint and height, given by seed and cell id.
@@ -205,7 +210,7 @@ fn measure(
     sets: &StateSets,
     viewpoints: &[(Suspect, u64)],
     rays: u32,
-) -> Vec<ViewpointError> {
+) -> (Vec<ViewpointError>, Vec<PrimitiveId>) {
     let members = StateMembers::new(sets, geometry.primitive_count());
     let batches = Batches::new(rays);
     let pieces: Vec<(usize, u32, &Lattice, usize)> = (0..viewpoints.len())
@@ -214,31 +219,54 @@ fn measure(
             (0..lattice.len()).step_by(CHUNK).map(move |start| (v, batch, lattice, start))
         })
         .collect();
-    let counts: Vec<(usize, u32)> = pieces
+    let counts: Vec<(usize, u32, Vec<PrimitiveId>)> = pieces
         .into_par_iter()
         .map_init(Tracer::default, |tracer, (v, batch, lattice, start)| {
             let (at, seed) = viewpoints[v];
             let range = start..lattice.len().min(start + CHUNK);
-            let wrong = lattice
-                .directions(batch_seed(seed, batch), range)
-                .filter(|&direction| {
-                    let ray = Ray { origin: at.viewpoint, direction, moment: at.moment };
-                    tracer.is_wrong(geometry, &members, ray)
-                })
-                .count();
-            (v, wrong as u32)
+            let rays = viewpoint_rays(lattice, at, batch_seed(seed, batch), range);
+            let wrong = rays.filter(|&ray| tracer.is_wrong(geometry, &members, ray)).count();
+            (v, wrong as u32, tracer.take_missing())
         })
         .collect();
     let mut wrong = vec![0u32; viewpoints.len()];
-    for (v, count) in counts {
+    let mut missing = Vec::new();
+    for (v, count, of_piece) in counts {
         wrong[v] += count;
+        missing.extend(of_piece);
     }
     let errors = viewpoints.iter().zip(wrong).map(|(&(at, seed), wrong)| {
         let error = f64::from(wrong) / f64::from(rays.max(1));
         let Suspect { viewpoint, moment } = at;
         ViewpointError { viewpoint, moment, rays, wrong, error, seed }
     });
-    errors.collect()
+    (errors.collect(), missing)
+}
+
+/// Some of the rays of a lattice at a viewpoint.
+fn viewpoint_rays(
+    lattice: &Lattice,
+    at: Suspect,
+    seed: u64,
+    range: Range<usize>,
+) -> impl Iterator<Item = Ray> {
+    lattice.directions(seed, range).map(move |direction| Ray {
+        origin: at.viewpoint,
+        direction,
+        moment: at.moment,
+    })
+}
+
+/// All rays of a viewpoint's measurement with a seed.
+pub(crate) fn rays_at(
+    at: Suspect,
+    rays: u32,
+    seed: u64,
+    mut look: impl FnMut(Ray) -> bool,
+) -> bool {
+    Batches::new(rays).iter().any(|(batch, lattice)| {
+        viewpoint_rays(lattice, at, batch_seed(seed, batch), 0..lattice.len()).any(&mut look)
+    })
 }
 
 /// True when something can be seen and hides nothing.
@@ -254,9 +282,16 @@ pub(crate) struct Tracer {
     caster: RayCaster,
     missing: Vec<Hit>,
     present: Vec<Hit>,
+    /// What the set lacks of what wrong rays met.
+    lacking: Vec<PrimitiveId>,
 }
 
 impl Tracer {
+    /// What the set lacks of what wrong rays met since the last call.
+    pub(crate) fn take_missing(&mut self) -> Vec<PrimitiveId> {
+        std::mem::take(&mut self.lacking)
+    }
+
     /// The definition of the crate's documentation.
     pub(crate) fn is_wrong(
         &mut self,
@@ -271,6 +306,7 @@ impl Tracer {
         {
             let of_set = self.caster.closest_occluder(geometry, ray, f64::INFINITY, present);
             if !of_set.is_some_and(|other| ties(geometry, ray, hit, other)) {
+                self.lacking.push(hit.primitive);
                 return true;
             }
         }
@@ -284,7 +320,7 @@ impl Tracer {
         ray: Ray,
         nearest: Option<Hit>,
     ) -> bool {
-        let Self { caster, missing, present } = self;
+        let Self { caster, missing, present, lacking } = self;
         missing.clear();
         present.clear();
         let limit = nearest.map_or(f64::INFINITY, |hit| hit.distance);
@@ -296,7 +332,7 @@ impl Tracer {
             }
         });
         // Nearest first, so that `ties` sees its arguments in order.
-        missing.iter().any(|&gone| {
+        let is_wrong = missing.iter().any(|&gone| {
             let behind = nearest.is_some_and(|wall| ties(geometry, ray, gone, wall));
             let replaced = present.iter().any(|&other| {
                 let (near, far) =
@@ -304,6 +340,10 @@ impl Tracer {
                 ties(geometry, ray, near, far)
             });
             !behind && !replaced
-        })
+        });
+        if is_wrong {
+            lacking.extend(missing.iter().map(|hit| hit.primitive));
+        }
+        is_wrong
     }
 }

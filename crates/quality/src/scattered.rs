@@ -23,7 +23,9 @@ use std::sync::OnceLock;
 use glam::DVec3;
 use rayon::prelude::*;
 use sightline_geometry::raycast::Ray;
-use sightline_geometry::{InstancedGeometry, Moment, PrimitiveSet, StateSets, Timeline, ViewCell};
+use sightline_geometry::{
+    InstancedGeometry, Moment, PrimitiveId, PrimitiveSet, StateSets, Timeline, ViewCell,
+};
 
 use crate::directions::Lattice;
 use crate::measure::Tracer;
@@ -62,12 +64,49 @@ pub fn measure_scattered(
     let sets = StateSets::constant(0..1, set.clone());
     let members = StateMembers::new(&sets, geometry.primitive_count());
     let timeline = Timeline::at_rest();
-    let wrong = measure_scattered_over(geometry, &members, &timeline, cell, batch, seed);
-    wrong.into_iter().map(|suspect| suspect.viewpoint).collect()
+    let found = measure_scattered_over(geometry, &members, &timeline, cell, batch, seed);
+    found.wrong.into_iter().map(|suspect| suspect.viewpoint).collect()
+}
+
+/// What a batch of rays found.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scattered {
+    /// Rays that are wrong, in a fixed order.
+    pub wrong: Vec<Suspect>,
+    /// Primitives that these rays met and the set lacks, in a fixed order; some of them often.
+    pub missing: Vec<PrimitiveId>,
+}
+
+/// The rays `range` of a batch in a cell.
+pub(crate) fn scattered_rays<'a>(
+    lattice: &'a Lattice,
+    timeline: &'a Timeline,
+    states: &'a Range<u32>,
+    cell: &'a ViewCell,
+    (batch, seed): (u32, u64),
+    range: Range<usize>,
+) -> impl Iterator<Item = Ray> + 'a {
+    let directions = viewpoint_seed(seed, cell.id, batch);
+    // Three numbers a viewpoint, and one a moment.
+    let mut random = SplitMix64::at(placement_seed(directions, cell.id), 3 * range.start as u64);
+    let mut clock = SplitMix64::at(moment_seed(directions, cell.id), range.start as u64);
+    lattice.directions(directions, range).map(move |direction| {
+        let (u, v, h) = (random.next_unit(), random.next_unit(), random.next_unit());
+        let moment = timeline.moment(states, clock.next_unit());
+        Ray { origin: cell.viewpoint(u, v, h), direction, moment }
+    })
+}
+
+/// The directions of a batch, and where its pieces of work start.
+pub(crate) fn scattered_pieces() -> (&'static Lattice, Vec<Range<usize>>) {
+    static LATTICE: OnceLock<Lattice> = OnceLock::new();
+    let lattice = LATTICE.get_or_init(|| Lattice::new(SCATTERED_BATCH));
+    let len = lattice.len();
+    (lattice, (0..len).step_by(CHUNK).map(|start| start..len.min(start + CHUNK)).collect())
 }
 
 /// Casts batch number `batch` of a measurement over the states of `members`: [`SCATTERED_BATCH`] rays,
-/// at random moments. Gives those that are wrong, in a fixed order.
+/// at random moments.
 ///
 /// # Panics
 /// When a set has a member that the geometry lacks, or the timeline lacks a state.
@@ -79,30 +118,24 @@ pub fn measure_scattered_over(
     cell: &ViewCell,
     batch: u32,
     seed: u64,
-) -> Vec<Suspect> {
-    static LATTICE: OnceLock<Lattice> = OnceLock::new();
-    let lattice = LATTICE.get_or_init(|| Lattice::new(SCATTERED_BATCH));
-    let directions = viewpoint_seed(seed, cell.id, batch);
-    let places = placement_seed(directions, cell.id);
-    let times = moment_seed(directions, cell.id);
+) -> Scattered {
+    let (lattice, pieces) = scattered_pieces();
     let states: Range<u32> = members.sets().states();
-    let starts: Vec<usize> = (0..lattice.len()).step_by(CHUNK).collect();
-    let wrong: Vec<Vec<Suspect>> = starts
+    let found: Vec<Scattered> = pieces
         .into_par_iter()
-        .map_init(Tracer::default, |tracer, start| {
-            let range = start..lattice.len().min(start + CHUNK);
-            // Three numbers a viewpoint, and one a moment.
-            let mut random = SplitMix64::at(places, 3 * start as u64);
-            let mut clock = SplitMix64::at(times, start as u64);
-            let rays = lattice.directions(directions, range).map(|direction| {
-                let (u, v, h) = (random.next_unit(), random.next_unit(), random.next_unit());
-                let moment = timeline.moment(&states, clock.next_unit());
-                Ray { origin: cell.viewpoint(u, v, h), direction, moment }
-            });
-            rays.filter(|&ray| tracer.is_wrong(geometry, members, ray))
+        .map_init(Tracer::default, |tracer, range| {
+            let rays = scattered_rays(lattice, timeline, &states, cell, (batch, seed), range);
+            let wrong = rays
+                .filter(|&ray| tracer.is_wrong(geometry, members, ray))
                 .map(|ray| Suspect { viewpoint: ray.origin, moment: ray.moment })
-                .collect()
+                .collect();
+            Scattered { wrong, missing: tracer.take_missing() }
         })
         .collect();
-    wrong.concat()
+    let mut all = Scattered::default();
+    for piece in found {
+        all.wrong.extend(piece.wrong);
+        all.missing.extend(piece.missing);
+    }
+    all
 }

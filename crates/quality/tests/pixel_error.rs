@@ -287,7 +287,7 @@ fn random_moments_are_uniform_over_time() {
     let over = |sets: &StateSets, seed| -> Vec<Suspect> {
         let members = StateMembers::new(sets, scene.primitive_count());
         (0..20)
-            .flat_map(|b| measure_scattered_over(&scene, &members, &clock(), &cell, b, seed))
+            .flat_map(|b| measure_scattered_over(&scene, &members, &clock(), &cell, b, seed).wrong)
             .collect()
     };
     let wrong = over(&sets, 1);
@@ -301,7 +301,7 @@ fn random_moments_are_uniform_over_time() {
     for threads in [1, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let again =
-            pool.install(|| measure_scattered_over(&scene, &members, &clock(), &cell, 0, 1));
+            pool.install(|| measure_scattered_over(&scene, &members, &clock(), &cell, 0, 1).wrong);
         assert_eq!(again, wrong[..again.len()], "the same on {threads} threads");
     }
     let full = measure_cell_over(&scene, &sets, &clock(), &cell, 50, 1000, 1);
@@ -321,7 +321,7 @@ fn viewpoints_and_directions_do_not_depend_on_whether_something_moves() {
     let still = measure_scattered(&scene, &set, &cell(), 0, 4);
     let sets = StateSets::constant(0..3, set.clone());
     let members = StateMembers::new(&sets, scene.primitive_count());
-    let moving = measure_scattered_over(&scene, &members, &clock(), &cell(), 0, 4);
+    let moving = measure_scattered_over(&scene, &members, &clock(), &cell(), 0, 4).wrong;
     assert!(moving.iter().map(|s| s.viewpoint).eq(still));
     assert!(moving.windows(2).any(|w| w[0].moment.state != w[1].moment.state));
     let still = measure_cell(&scene, &set, &cell(), 5, 1000, 11);

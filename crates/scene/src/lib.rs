@@ -5,6 +5,7 @@
 //! file alone, or refuses it with a [`SceneError`] that names the cause. Memory follows unique
 //! triangles, not instances, and particles times key frames.
 
+mod content;
 mod degenerate;
 mod digest;
 mod error;
@@ -18,6 +19,7 @@ pub mod region;
 mod report;
 mod scene;
 
+pub use content::{Edit, ObjectHash, Same, SceneContent};
 pub use digest::{FileDigest, SceneDigest, digest, digest_with, external_buffers};
 pub use error::{Cause, Place, SceneError, UriProblem};
 pub use memory::{Held, Keeper, MemoryLimit, default_folder};

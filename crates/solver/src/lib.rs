@@ -20,6 +20,7 @@
 //! [`mod@reference`] solves the same definition in exact rational arithmetic, with no culling and no
 //! floats; the tests compare the two.
 
+mod affected;
 pub mod arc;
 pub mod bernstein;
 pub mod bounds;
@@ -33,6 +34,9 @@ mod segment;
 mod states;
 mod tile;
 
+pub use affected::{Added, is_affected};
 pub use lists::{Pixel, visit_intervals};
-pub use segment::{SegmentVisibility, SolveOptions, Statistics, solve_segment, solve_segment_with};
+pub use segment::{
+    SegmentTrace, SegmentVisibility, SolveOptions, Statistics, solve_segment, solve_segment_with,
+};
 pub use states::{Known, StateVisibility, TimePath, solve_states};

@@ -67,6 +67,18 @@ pub struct SegmentVisibility {
     pub missing: f64,
     /// What it took; of several runs of states that were solved together, the first has all.
     pub statistics: Statistics,
+    /// Where it looked, of a scene at rest.
+    pub trace: SegmentTrace,
+}
+
+/// Where a solve of a scene at rest looked, and what it saw too little of: with the visible set, all that
+/// its result depends on. See [`crate::is_affected`].
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct SegmentTrace {
+    /// For each pass behind the first, which looks everywhere, the numbers of its tiles, ascending.
+    pub tiles: Vec<Vec<u32>>,
+    /// Primitives that were nearest somewhere, but nowhere on enough to be visible.
+    pub grazed: PrimitiveSet,
 }
 
 /// Counters of one solve.
@@ -100,7 +112,7 @@ type States = u64;
 
 /// A tile of a pass's grid.
 #[derive(Clone, Copy, Debug)]
-struct Tile {
+pub(crate) struct Tile {
     face: usize,
     /// Place in the grid, in tiles.
     row: u32,
@@ -127,13 +139,13 @@ struct Find {
 type Finds = Vec<Find>;
 
 /// The grid of one pass.
-struct Grid {
-    sampling: Sampling,
+pub(crate) struct Grid {
+    pub(crate) sampling: Sampling,
     columns: Vec<Column>,
 }
 
 impl Grid {
-    fn new(sampling: Sampling, frame: &RectifiedFrame, bounds: &ErrorBounds) -> Self {
+    pub(crate) fn new(sampling: Sampling, frame: &RectifiedFrame, bounds: &ErrorBounds) -> Self {
         let columns = (0..sampling.columns())
             .map(|j| Column::new(sampling.column(j), frame.length, bounds))
             .collect();
@@ -144,6 +156,43 @@ impl Grid {
     fn tiles(&self) -> (u32, u32) {
         let tiles = |rays: u32, size: usize| rays.div_ceil(size as u32);
         (tiles(self.sampling.rows(), TILE_ROWS), tiles(self.sampling.columns(), TILE_COLUMNS))
+    }
+
+    /// Number of a tile in the order of [`Grid::all_tiles`].
+    fn number(&self, tile: &Tile) -> u32 {
+        let (rows, columns) = self.tiles();
+        (tile.face as u32 * rows + tile.row) * columns + tile.column
+    }
+
+    /// Face, rows and columns of the tile with a number.
+    ///
+    /// # Panics
+    /// When there is none.
+    pub(crate) fn rays(&self, number: u32) -> (usize, Vec<f64>, &[Column]) {
+        let (rows, columns) = self.tiles();
+        let (column, row) = (number % columns, number / columns % rows);
+        let (rows, columns) = self.rays_of(row, column);
+        (self.face_of(number), rows, columns)
+    }
+
+    fn face_of(&self, number: u32) -> usize {
+        let (rows, columns) = self.tiles();
+        let face = (number / columns / rows) as usize;
+        assert!(face < FACE_COUNT, "tile {number} is not in the grid");
+        face
+    }
+
+    /// Number of tiles.
+    pub(crate) fn tile_count(&self) -> u32 {
+        let (rows, columns) = self.tiles();
+        FACE_COUNT as u32 * rows * columns
+    }
+
+    fn rays_of(&self, row: u32, column: u32) -> (Vec<f64>, &[Column]) {
+        let first_row = row * TILE_ROWS as u32;
+        let end_row = self.sampling.rows().min(first_row + TILE_ROWS as u32);
+        let rows = (first_row..end_row).map(|i| self.sampling.row(i)).collect();
+        (rows, &self.columns[column as usize * TILE_COLUMNS..][..TILE_COLUMNS])
     }
 
     /// The tiles of all faces.
@@ -179,9 +228,8 @@ impl Grid {
         let sampling = self.sampling;
         let first_row = tile.row * TILE_ROWS as u32;
         let first_column = tile.column * TILE_COLUMNS as u32;
-        let end_row = sampling.rows().min(first_row + TILE_ROWS as u32);
-        let rows: Vec<f64> = (first_row..end_row).map(|i| sampling.row(i)).collect();
-        let columns = &self.columns[first_column as usize..][..TILE_COLUMNS];
+        let (rows, columns) = self.rays_of(tile.row, tile.column);
+        let end_row = first_row + rows.len() as u32;
         let settled = units.and_then(|(_, settled)| settled);
         if settled.is_some_and(|settled| solver.meets_only(settled, context, &rows, columns)) {
             return Finds::new();
@@ -403,8 +451,10 @@ impl Solve<'_> {
         // What the passes before saw, and in which states.
         let mut before: Vec<(u32, States)> = Vec::new();
         let mut settled: Option<Settled> = None;
+        let mut looked: Vec<Vec<u32>> = Vec::new();
+        let mut grazed: Vec<u32> = Vec::new();
         for pass in 0..=options.passes {
-            let solved: Vec<(Finds, TileCounters)> = tiles
+            let mut solved: Vec<(Finds, TileCounters, Vec<u32>)> = tiles
                 .par_iter()
                 .with_min_len(TILES_AT_ONCE)
                 .map_init(TileSolver::default, |solver, tile| {
@@ -414,11 +464,12 @@ impl Solve<'_> {
                     let context = TileContext { geometry, frame: &frame, face, bounds: &bounds };
                     let units = units.map(|units| (units, settled.as_ref()));
                     let finds = grid.solve(&context, solver, tile, time, units);
-                    (finds, solver.counters)
+                    (finds, solver.counters, std::mem::take(&mut solver.grazed))
                 })
                 .collect();
             // Weights are added when it is known what share of its directions a tile weighs.
-            for (finds, counters) in &solved {
+            for (finds, counters, own) in &mut solved {
+                grazed.append(own);
                 statistics = statistics.plus(*counters);
                 found.extend(finds.iter().map(|f| Find { weight: 0, ..*f }));
             }
@@ -441,7 +492,7 @@ impl Solve<'_> {
             let finer = Grid::new(grid.sampling.finer(), &frame, &bounds);
             let mut next = Vec::new();
             let mut alone = vec![0u64; count as usize];
-            for (tile, (finds, _)) in tiles.iter().zip(&solved) {
+            for (tile, (finds, ..)) in tiles.iter().zip(&solved) {
                 alone.fill(0);
                 for find in finds.iter().filter(|f| f.rays == 1) {
                     let at = alone_in.binary_search_by_key(&find.primitive, |a| a.0);
@@ -476,10 +527,21 @@ impl Solve<'_> {
                 break;
             }
             (grid, tiles) = (finer, next);
+            let mut numbers: Vec<u32> = tiles.iter().map(|tile| grid.number(tile)).collect();
+            numbers.sort_unstable();
+            looked.push(numbers);
         }
-        runs(&found, states, &missing, statistics, |first| {
+        let mut runs = runs(&found, states, &missing, statistics, |first| {
             units.map_or(first..first + 1, |units| units.of(geometry, PrimitiveId(first)))
-        })
+        });
+        if let (None, [only]) = (time, &mut runs[..]) {
+            let set = &only.visibility.set;
+            grazed.retain(|primitive| !set.contains(PrimitiveId(*primitive)));
+            grazed.sort_unstable();
+            let grazed = PrimitiveSet::from_sorted(grazed);
+            only.visibility.trace = SegmentTrace { tiles: looked, grazed };
+        }
+        runs
     }
 }
 
@@ -526,7 +588,8 @@ fn runs(
         let missing = missing[first as usize];
         // What it took is counted once.
         let statistics = if first == 0 { statistics } else { TileCounters::default() };
-        let visibility = SegmentVisibility { set, weights, missing, statistics };
+        let visibility =
+            SegmentVisibility { set, weights, missing, statistics, ..Default::default() };
         let run = states.start + first..states.start + last + 1;
         match out.last_mut() {
             Some(before) if before.visibility.same_result(&visibility) => {

@@ -31,7 +31,8 @@ use std::cmp::Ordering;
 
 use glam::{DMat3, DVec3};
 use sightline_geometry::{
-    Face, InstanceId, InstancedGeometry, Mesh, Node, RectifiedFrame, STEPS, TopLevel,
+    Face, InstanceId, InstancedGeometry, Mesh, Node, PrimitiveId, PrimitiveSet, RectifiedFrame,
+    STEPS, TopLevel,
 };
 
 use crate::{
@@ -237,6 +238,9 @@ pub struct TileSolver {
     moving: moving::MovingSolver,
     /// See-through finds: (primitive, pixel in tile, length in t).
     seen_through: Vec<(u32, u32, f64)>,
+    /// Primitives that were nearest on so little of a ray that it does not count, in no order; whoever
+    /// solves tiles clears it.
+    pub grazed: Vec<u32>,
     pub counters: TileCounters,
     /// Do without the instructions that only some processors have.
     pub portable: bool,
@@ -307,6 +311,22 @@ impl TileSolver {
         }
     }
 
+    /// True when one of `wanted`, or anything, is nearest on some part of a ray of the tile, however
+    /// small, or seen through nothing. The scene is at rest.
+    pub fn sees_any(
+        &mut self,
+        context: &TileContext,
+        w: &[f64],
+        c: &[Column],
+        wanted: Option<&PrimitiveSet>,
+    ) -> bool {
+        let mut sees = false;
+        let is_wanted = |p: u32| wanted.is_none_or(|set| set.contains(PrimitiveId(p)));
+        self.grazed.clear();
+        self.solve(context, w, c, None, |_, primitive, _, _| sees |= is_wanted(primitive));
+        sees || self.grazed.drain(..).any(is_wanted)
+    }
+
     /// Takes the beam of these rows and columns, with nothing found in it.
     #[inline(always)]
     fn aim(&mut self, context: &TileContext, w: &[f64], c: &[Column]) {
@@ -340,6 +360,8 @@ impl TileSolver {
                 intervals += 1;
                 if interval.counts() {
                     found(when, interval.primitive, pixel, interval.end - interval.start);
+                } else {
+                    self.grazed.push(interval.primitive);
                 }
             });
             self.counters.intervals += intervals;

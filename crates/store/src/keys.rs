@@ -6,7 +6,10 @@
 //! data/<kind>-<hash>.parquet        immutable, named by content
 //! bake/<bake>/plan.bin              the plan
 //! bake/<bake>/epochs/00000001       coordinator epochs
+//! bake/<bake>/content.bin           what the scene is made of
+//! bake/<bake>/edit.bin              what it has in common with an earlier bake
 //! bake/<bake>/parts/<task>-<attempt>[-cells|-objects].parquet
+//! bake/<bake>/parts/<task>-<attempt>-traces.bin
 //! bake/<bake>/commits/<task>        finished tasks
 //! bake/scene/<hash>                 a file of a scene, named by its content, for workers to fetch
 //! bake/probe/                       scratch of the start-up probe
@@ -24,6 +27,8 @@ pub const PROBE_FOLDER: &str = "bake/probe";
 /// Folder of the copies of scene files, shared by all bakes.
 pub const SCENE_FOLDER: &str = "bake/scene";
 
+const CONTENT: &str = "content.bin";
+
 /// What a part file holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PartKind {
@@ -33,6 +38,8 @@ pub enum PartKind {
     Cells,
     /// Rows of (cell, object).
     Objects,
+    /// What the results depend on.
+    Traces,
 }
 
 /// Key of a manifest.
@@ -52,6 +59,25 @@ pub fn manifest_number(key: &str) -> Option<u64> {
 #[must_use]
 pub fn plan(bake: &str) -> String {
     format!("{BAKE_FOLDER}/{bake}/plan.bin")
+}
+
+/// Key of what the scene of a bake is made of.
+#[must_use]
+pub fn content(bake: &str) -> String {
+    format!("{BAKE_FOLDER}/{bake}/{CONTENT}")
+}
+
+/// The bake that a key of [`content`] belongs to.
+#[must_use]
+pub fn content_bake(key: &str) -> Option<&str> {
+    let bake = key.strip_prefix(BAKE_FOLDER)?.strip_prefix('/')?.strip_suffix(CONTENT)?;
+    bake.strip_suffix('/').filter(|bake| !bake.contains('/'))
+}
+
+/// Key of what a bake has in common with an earlier one.
+#[must_use]
+pub fn edit(bake: &str) -> String {
+    format!("{BAKE_FOLDER}/{bake}/edit.bin")
 }
 
 /// Key of the copy of a scene file with this BLAKE3 hash, hexadecimal.
@@ -82,11 +108,12 @@ pub fn parts(bake: &str) -> String {
 #[must_use]
 pub fn part(bake: &str, task: u32, attempt: &str, kind: PartKind) -> String {
     let suffix = match kind {
-        PartKind::Segments => "",
-        PartKind::Cells => "-cells",
-        PartKind::Objects => "-objects",
+        PartKind::Segments => ".parquet",
+        PartKind::Cells => "-cells.parquet",
+        PartKind::Objects => "-objects.parquet",
+        PartKind::Traces => "-traces.bin",
     };
-    format!("{BAKE_FOLDER}/{bake}/parts/{task:08}-{attempt}{suffix}.parquet")
+    format!("{BAKE_FOLDER}/{bake}/parts/{task:08}-{attempt}{suffix}")
 }
 
 /// Folder of a bake's commits.

@@ -9,10 +9,10 @@ use rand::rngs::SmallRng;
 use rand::{Rng, SeedableRng};
 use sightline_jobs::TaskId;
 use sightline_worker::AttemptError;
-use sightline_worker::compute::{Compute, Computed, Job, Part};
+use sightline_worker::compute::{Compute, Computed, Job, Output};
 
 /// The results of all tasks that were computed so far.
-pub type Results = Arc<Mutex<BTreeMap<TaskId, Vec<Part>>>>;
+pub type Results = Arc<Mutex<BTreeMap<TaskId, Output>>>;
 
 /// How a worker computes.
 #[derive(Clone, Copy, Debug)]
@@ -57,14 +57,14 @@ impl Compute for SimCompute {
             return Err(AttemptError::Panic("a fault of the simulation".into()));
         }
         let mut results = self.results.lock().unwrap_or_else(PoisonError::into_inner);
-        let parts = match results.get(&task) {
-            Some(parts) => parts.clone(),
+        let output = match results.get(&task) {
+            Some(output) => output.clone(),
             None => {
-                let parts = job()?;
-                results.insert(task, parts.clone());
-                parts
+                let output = job()?;
+                results.insert(task, output.clone());
+                output
             }
         };
-        Ok(Computed { parts, took })
+        Ok(Computed { output, took })
     }
 }

@@ -248,7 +248,7 @@ impl<'a> Simulation<'a> {
     fn add_host(&self, sim: &mut turmoil::Sim<'_>, host: usize) {
         let controls = Arc::clone(&self.controls);
         let store = BakeStore::new(Arc::new(self.store.of_host(host)), Key::default(), "simulated");
-        let Prepared { plan, publisher, scene } = &self.bake.prepared;
+        let Prepared { plan, publisher, scene, .. } = &self.bake.prepared;
         if host < COORDINATORS {
             let (plan, publisher) = (plan.clone(), publisher.clone());
             sim.host(name(host), move || {

@@ -8,11 +8,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use serde_json::{Value, json};
+use sightline_coordinator::edit;
 use sightline_coordinator::{
     Coordinator, CoordinatorHandle, CoordinatorOptions, Prepared, Summary as Ended, prepare_from,
 };
 use sightline_jobs::{BakeConfig, BakeStatus, Done, Phase, Plan};
-use sightline_scene::{Keeper, SceneDigest};
+use sightline_scene::{Keeper, SceneContent, SceneDigest};
 use sightline_store::{BakeStore, Dataset, StoreError, keys};
 use sightline_worker::{Worker, WorkerOptions};
 use tokio::sync::oneshot;
@@ -140,6 +141,19 @@ pub async fn open_store(input: &BakeInput, digest: &SceneDigest, plan: &Plan) ->
     Ok(store)
 }
 
+/// Says what a bake has in common with an earlier one.
+pub async fn compare(store: &BakeStore, plan: &Plan, content: Option<&SceneContent>) -> Result<()> {
+    if let Some(common) = edit::compare(store, plan, content).await? {
+        let changed = count(common.objects - common.same, "object");
+        let all = thousands(common.objects);
+        note(&format!(
+            "{changed} of {all} changed since the bake {}: cells that see nothing of it are taken over",
+            common.bake
+        ));
+    }
+    Ok(())
+}
+
 /// Runs coordinator and worker to the end.
 async fn solve(
     prepared: Prepared,
@@ -148,7 +162,8 @@ async fn solve(
     joining: &Joining,
     phases: &mut Phases,
 ) -> Result<Ended> {
-    let Prepared { scene, plan, publisher } = prepared;
+    let Prepared { scene, plan, publisher, content } = prepared;
+    compare(&store, &plan, content.as_ref()).await?;
     let publisher = Arc::new(publisher);
     let mut options = CoordinatorOptions::new(joining.address(), store.clone(), plan, publisher);
     if joining.listen.is_none() {
@@ -265,6 +280,8 @@ impl Baked {
             "states": self.plan.states(),
             "tasks": self.plan.tasks.len(),
             "tasks_resumed": status.tasks_resumed,
+            "segments_reused": status.segments_reused,
+            "cells_reused": status.cells_reused,
             "solve_ms": status.solve_ms,
             "merge_ms": status.merge_ms,
             "worker_solve_ms": status.worker_solve_ms,
@@ -286,6 +303,12 @@ impl Baked {
         if resumed > 0 {
             let all = count(self.plan.tasks.len() as u64, "task");
             table.row("resumed", format!("{resumed} of {all} were done before"));
+        }
+        let Done { total, .. } = self.ended.status.cells;
+        let reused = self.ended.status.cells_reused;
+        if reused > 0 {
+            let (reused, all) = (thousands(reused), count(total, "cell"));
+            table.row("taken over", format!("{reused} of {all}"));
         }
         table.gap();
         self.phases.add_to(&mut table);

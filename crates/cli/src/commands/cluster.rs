@@ -12,7 +12,7 @@ use sightline_telemetry::WatchFlags;
 use sightline_telemetry::metrics::{Listener, Registry};
 use sightline_worker::{Worker, WorkerOptions};
 
-use super::bake::{open_store, prepare_on, read_config, watch};
+use super::bake::{compare, open_store, prepare_on, read_config, watch};
 use super::signalled;
 use crate::arguments::{Coordinator as CoordinatorCommand, Worker as WorkerCommand};
 use crate::failure::{Failure, Kind, Result};
@@ -24,7 +24,7 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
     let config = read_config(&command.input)?;
     let runtime = super::runtime()?;
     let health = runtime.block_on(serve_health(command.health))?;
-    let Prepared { scene, plan, publisher } = prepare_on(&command.input, config, None)?;
+    let Prepared { scene, plan, publisher, content } = prepare_on(&command.input, config, None)?;
     let ended = runtime.block_on(async {
         let store = open_store(&command.input, &scene.digest, &plan).await?;
         // The scene is the workers' matter from here on.
@@ -33,6 +33,7 @@ pub fn run_coordinator(command: &CoordinatorCommand) -> Result<()> {
         let found = super::scene::locate(scene, tables, &command.input.cache).await?;
         let share = command.share_scene;
         share_scene(&store, &plan.scene, &found.path, &plan.config, share).await?;
+        compare(&store, &plan, content.as_ref()).await?;
         let mut options = CoordinatorOptions::new(command.listen, store, plan, Arc::new(publisher));
         options.security = command.security.clone().into();
         let mut registry = Registry::default();

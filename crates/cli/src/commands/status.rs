@@ -216,6 +216,10 @@ fn text_of(status: &BakeStatus) -> String {
     if status.tasks_resumed > 0 {
         table.row("resumed", count(status.tasks_resumed.into(), "task"));
     }
+    if status.cells_reused + status.segments_reused > 0 {
+        let (segments, cells) = (thousands(status.segments_reused), thousands(status.cells_reused));
+        table.row("taken over", format!("{segments} segments, {cells} cells"));
+    }
     table.row("elapsed", duration(status.elapsed_ms as f64 / 1e3));
     let mut text = table.to_string();
     add_list(&mut text, "workers", status.workers_at_hand, worker_lines(status));

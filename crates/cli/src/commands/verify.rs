@@ -166,7 +166,7 @@ fn measure_row(
     }
     let at = Suspect { viewpoint, moment };
     let error = measure_viewpoint_at(&scene.geometry, sets, at, rays, seed);
-    Ok(CellError { cell: cell.id, viewpoints: vec![error] })
+    Ok(CellError { cell: cell.id, viewpoints: vec![error], missing: Vec::new() })
 }
 
 fn choose(dataset: &Dataset, command: &Verify) -> Result<Vec<CellId>> {
