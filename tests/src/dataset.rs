@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// The files of a dataset by relative path. `bake/`, the state of the bake, is no part of it.
+/// The files of a dataset by relative path. `bake/`, the state of the bake, is no part of it, nor is what
+/// a process that was killed had begun to write: until it is whole it has a temporary name, with a `#`.
 ///
 /// # Panics
 /// When a file cannot be read.
@@ -13,9 +14,11 @@ pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut open = vec![folder.to_owned()];
     while let Some(at) = open.pop() {
         for entry in std::fs::read_dir(&at).unwrap_or_else(|e| panic!("{}: {e}", at.display())) {
-            let path = entry.expect("a folder's entries can be read").path();
+            let entry = entry.expect("a folder's entries can be read");
+            let path = entry.path();
             let relative = path.strip_prefix(folder).expect("it is inside").to_owned();
-            if relative == Path::new("bake") {
+            let is_begun = entry.file_name().to_string_lossy().contains('#');
+            if is_begun || relative == Path::new("bake") {
                 continue;
             }
             if path.is_dir() {
