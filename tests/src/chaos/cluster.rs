@@ -16,6 +16,8 @@ use crate::tcp_proxy::TcpProxy;
 
 /// Longest delay of a chunk between workers and coordinator, ms.
 const DELAY_MS_MAX: u64 = 150;
+/// How long a supervisor takes to start a worker again.
+const RESTART_TIME: Duration = Duration::from_millis(500);
 /// Failures of coordinators behind the faults that are put up with: what went wrong last may only be
 /// noticed then.
 const FAILURES_WHEN_CALM_MAX: usize = 3;
@@ -42,8 +44,8 @@ pub(super) struct Cluster<'c> {
     port: u16,
     /// `None` between its end and its restart.
     coordinator: Option<Process>,
-    /// Coordinators that were replaced and have not ended.
-    replaced: Vec<Process>,
+    /// Coordinators that were stopped and replaced, and whether they had an epoch by then.
+    replaced: Vec<(Process, bool)>,
     workers: Vec<Option<Process>>,
     starts: u32,
     /// What will end the faults that last, and when.
@@ -119,7 +121,7 @@ impl<'c> Cluster<'c> {
                     self.gave_up.push(reason(&ended));
                 }
                 // It was asked to stop, or told of an end that the newest coordinator has yet to find.
-                self.start_worker(k);
+                self.reliefs.push((Instant::now() + RESTART_TIME, Relief::StartWorker(k)));
             }
         }
         false
@@ -157,7 +159,8 @@ impl<'c> Cluster<'c> {
             Fault::CoordinatorStoppedAndReplaced => {
                 let mut old = self.coordinator.take()?;
                 old.signal("STOP");
-                self.replaced.push(old);
+                let had_begun = old.stderr().contains("the bake starts");
+                self.replaced.push((old, had_begun));
                 self.port = free_port();
                 self.line.lead_to(self.port);
                 self.start_coordinator();
@@ -203,7 +206,7 @@ impl<'c> Cluster<'c> {
             Relief::StartWorker(_) | Relief::StartCoordinator => {}
             Relief::WakeWorker(k) => self.workers[k].iter_mut().for_each(|w| w.signal("CONT")),
             Relief::WakeCoordinators => {
-                let all = self.replaced.iter_mut().chain(&mut self.coordinator);
+                let all = self.replaced.iter_mut().map(|(old, _)| old).chain(&mut self.coordinator);
                 all.for_each(|coordinator| coordinator.signal("CONT"));
             }
             Relief::FreeConnections => {
@@ -237,7 +240,7 @@ impl<'c> Cluster<'c> {
 
     /// SIGKILL for all, and nobody is started again.
     pub fn kill_all(self) {
-        let all = self.replaced.into_iter().chain(self.coordinator);
+        let all = self.replaced.into_iter().map(|(old, _)| old).chain(self.coordinator);
         all.chain(self.workers.into_iter().flatten()).for_each(kill);
     }
 
@@ -254,8 +257,12 @@ impl<'c> Cluster<'c> {
         let late = &self.gave_up[failures..];
         assert!(is_over, "the bake does not end; meanwhile: {late:?}");
         assert!(late.len() <= FAILURES_WHEN_CALM_MAX, "nothing disturbs them: {late:?}");
-        // One that was replaced finds out from the store.
-        for old in self.replaced.drain(..) {
+        for (mut old, had_begun) in self.replaced.drain(..) {
+            // It finds out from the store. Stopped before it had an epoch, it took a newer one when it
+            // woke, and waits for workers.
+            if !had_begun {
+                old.signal("TERM");
+            }
             let _ = old.wait(LIMIT);
         }
         for mut worker in self.workers.drain(..).flatten() {

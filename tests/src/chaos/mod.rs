@@ -22,7 +22,7 @@
 //! - when the faults are over the bake ends, with the bytes of `sightline bake` undisturbed (VI-3);
 //! - when every process is killed for good half-way, the same `sightline bake` goes on to those bytes;
 //! - a pointer that is there when everybody was killed names that whole dataset already (JB-2);
-//! - no process panicked, and no coordinator that was replaced runs on.
+//! - no process panicked, and a coordinator that was replaced ends by itself.
 
 mod cluster;
 mod disk;

@@ -30,10 +30,10 @@ pub(super) fn run(campaign: &Campaign, asleep: Duration) {
     let mut sleeper = start(SLEEPER);
     let commit = stop_at_work(&mut sleeper, port, &out);
     // Others do what they can, and the task that the sleeper holds as well: cells wait for it.
-    let mut other = start("other");
+    let other = start("other");
     assert!(eventually(LIMIT, || commit.exists()), "nobody took its task:\n{}", other.stderr());
-    other.signal("TERM");
-    let _ = other.wait(LIMIT);
+    // Before it has done all the rest, so that there is a bake to come back to.
+    other.kill();
     let before = written(&out);
     eventually(asleep, || false);
     assert_eq!(written(&out), before, "nobody is at work");
