@@ -63,34 +63,43 @@ fn main() -> ExitCode {
     // Folders of broken runs are left for whoever looks into them.
     let folder = tempfile::Builder::new().prefix("sightline-chaos-").tempdir();
     let folder = folder.expect("a temporary folder can be made").keep();
-    let is_kept = match arguments.sleeper_minutes {
-        Some(minutes) => sleeps(&folder, Duration::from_secs(60 * minutes)),
-        None => {
-            let kept = arguments.store.stores().into_iter().map(|s| keeps(s, &arguments, &folder));
-            kept.fold(true, |all, kept| all && kept)
+    let mut is_kept = true;
+    if let Some(minutes) = arguments.sleeper_minutes {
+        is_kept = sleeps(&folder, Duration::from_secs(60 * minutes));
+    } else {
+        for store in arguments.store.stores() {
+            is_kept &= keeps(store, &arguments, &folder);
         }
-    };
-    if is_kept {
-        let _ = std::fs::remove_dir_all(&folder);
-        return ExitCode::SUCCESS;
     }
-    say(&format!("what is left of broken runs is in {}", folder.display()));
-    ExitCode::FAILURE
+    // What is left is of broken runs.
+    if std::fs::remove_dir(&folder).is_err() {
+        say(&format!("what is left of broken runs is in {}", folder.display()));
+    }
+    if is_kept { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
 fn sleeps(folder: &std::path::Path, asleep: Duration) -> bool {
-    let campaign = Campaign::prepare(Store::Files, &folder.join("files"), "chaos");
+    let folder = folder.join("files");
+    let campaign = Campaign::prepare(Store::Files, &folder, "chaos");
     let campaign = campaign.expect("files need no server");
     let is_kept = catch_unwind(AssertUnwindSafe(|| campaign.sleeper(asleep))).is_ok();
+    tidy(&folder, is_kept);
     let ended = if is_kept { "changed nothing" } else { "BROKE A PROMISE" };
     say(&format!("a worker that slept for {} s and woke {ended}", asleep.as_secs()));
     is_kept
 }
 
+fn tidy(folder: &std::path::Path, is_kept: bool) {
+    if is_kept {
+        let _ = std::fs::remove_dir_all(folder);
+    }
+}
+
 /// True when every run kept its promises and every fault happened.
 fn keeps(store: Store, arguments: &Arguments, folder: &std::path::Path) -> bool {
     let name = store.name();
-    let Some(campaign) = Campaign::prepare(store, &folder.join(name), "chaos") else {
+    let folder = folder.join(name);
+    let Some(campaign) = Campaign::prepare(store, &folder, "chaos") else {
         say(&format!("{name}: its server is not installed; `bash tests/run` does that"));
         return false;
     };
@@ -114,5 +123,6 @@ fn keeps(store: Store, arguments: &Arguments, folder: &std::path::Path) -> bool 
     if !broken.is_empty() {
         say(&format!("  BROKEN by the seeds {broken:?}"));
     }
+    tidy(&folder, broken.is_empty());
     broken.is_empty() && never.is_empty()
 }

@@ -113,7 +113,7 @@ pub(super) fn draw(rng: &mut SmallRng, store: Store, seed: u64, lease_ms: u64) -
             Fault::WorkerStopped => rng.random_range(10..lease_ms * 3 / 4),
             _ => rng.random_range(10..lease_ms * 3 / 2),
         };
-        let after = Duration::from_millis(rng.random_range(0..400));
+        let after = Duration::from_millis(rng.random_range(0..250));
         Spell { fault, after, lasts: Duration::from_millis(lasts_ms) }
     };
     faults.into_iter().map(&mut spell).collect()
