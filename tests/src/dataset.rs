@@ -28,14 +28,17 @@ pub fn files_below(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     found
 }
 
-/// The files of a dataset by relative path. `bake/`, the state of the bake, is no part of it.
+/// The files of a dataset by relative path. `bake/`, the state of the bake, is no part of it, nor is what
+/// a process that was killed had begun to write: until it is whole it has a temporary name, with a `#`.
 ///
 /// # Panics
 /// When a file cannot be read.
 #[must_use]
 pub fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = files_below(folder);
-    found.retain(|path, _| !path.starts_with("bake"));
+    let is_begun =
+        |path: &Path| path.file_name().is_some_and(|name| name.to_string_lossy().contains('#'));
+    found.retain(|path, _| !path.starts_with("bake") && !is_begun(path));
     found
 }
 

@@ -9,7 +9,7 @@
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -105,6 +105,7 @@ struct Shared {
     faults: Faults,
     requests: AtomicU64,
     met: [AtomicU64; 6],
+    is_calm: AtomicBool,
 }
 
 /// A running proxy; it ends when dropped.
@@ -129,8 +130,8 @@ impl FlakyProxy {
         let listener =
             runtime.block_on(TcpListener::bind((Ipv4Addr::LOCALHOST, 0))).expect("a port is free");
         let port = listener.local_addr().expect("it has an address").port();
-        let (requests, met) = Default::default();
-        let shared = Arc::new(Shared { server, faults, requests, met });
+        let (requests, met, is_calm) = Default::default();
+        let shared = Arc::new(Shared { server, faults, requests, met, is_calm });
         runtime.spawn(accept(listener, Arc::clone(&shared)));
         Self { runtime: Some(runtime), port, shared }
     }
@@ -139,6 +140,11 @@ impl FlakyProxy {
     #[must_use]
     pub const fn port(&self) -> u16 {
         self.port
+    }
+
+    /// Ends the faults: requests from now on pass.
+    pub fn calm(&self) {
+        self.shared.is_calm.store(true, Ordering::Relaxed);
     }
 
     /// Requests so far.
@@ -177,6 +183,7 @@ async fn pass_on(mut client: TcpStream, shared: &Shared) -> std::io::Result<()> 
     let Some(request) = read_request(&mut client).await? else { return Ok(()) };
     let number = shared.requests.fetch_add(1, Ordering::Relaxed);
     let (fault, chance) = shared.faults.of(number);
+    let fault = fault.filter(|_| !shared.is_calm.load(Ordering::Relaxed));
     if let Some(fault) = fault {
         shared.met[fault as usize].fetch_add(1, Ordering::Relaxed);
     }

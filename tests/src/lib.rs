@@ -5,6 +5,7 @@
 pub mod binaries;
 pub mod campaign;
 pub mod certificates;
+pub mod chaos;
 pub mod city;
 pub mod conformance;
 pub mod dataset;
@@ -20,4 +21,5 @@ pub mod scenes;
 pub mod servers;
 pub mod simulation;
 pub mod sources;
+pub mod tcp_proxy;
 pub mod workspace;

@@ -169,6 +169,13 @@ impl Server {
         shut_out(command).envs(self.environment.iter().map(|(k, v)| (k, v)))
     }
 
+    /// As [`Server::admit`], by way of a proxy on another port.
+    pub fn admit_by<'c>(&self, command: &'c mut Command, port: u16) -> &'c mut Command {
+        let (own, other) = (format!(":{}", self.port), format!(":{port}"));
+        let led = self.environment.iter().map(|(k, v)| (k, v.replace(&own, &other)));
+        shut_out(command).envs(led)
+    }
+
     /// Runs the command `objects` on this server.
     ///
     /// # Panics
