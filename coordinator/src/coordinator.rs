@@ -37,6 +37,8 @@ const OUTAGE_PAUSE_MS: u64 = 200;
 const OUTAGE_PAUSE_MS_MAX: u64 = 10_000;
 /// Time between two looks for a newer epoch in the store, ms.
 const EPOCH_CHECK_MS: u64 = 5_000;
+/// Time between two looks for commits in the store while no worker is at hand, ms.
+const COMMITS_CHECK_MS: u64 = 30_000;
 /// The same when somebody spoke of a newer epoch: who says so again and again costs little.
 const EPOCH_DOUBT_MS: u64 = 500;
 /// Calls that a connection may have in flight.
@@ -218,7 +220,8 @@ impl Coordinator {
         let is_encrypted = gate.tls().is_some();
         let server = tokio::spawn(serve(accepted, Arc::clone(&shared), gate, server_stopped));
         let audited = Arc::clone(&shared);
-        let run = Run { shared, options, addr, epoch_checked_ms: 0 };
+        let now_ms = shared.clock.now_ms();
+        let run = Run { shared, options, addr, epoch_checked_ms: 0, commits_checked_ms: now_ms };
         let end = tokio::spawn(async move {
             let end = run.drive(stopped).await;
             let _ = stop_server.send(());
@@ -407,6 +410,7 @@ struct Run {
     options: CoordinatorOptions,
     addr: SocketAddr,
     epoch_checked_ms: u64,
+    commits_checked_ms: u64,
 }
 
 impl Run {
@@ -481,6 +485,7 @@ impl Run {
             changed.as_mut().enable();
             self.end_lost_leases().await?;
             self.check_epoch().await?;
+            self.check_commits().await?;
             outage.is_over();
             self.shared.send_status();
             match self.shared.state().outcome() {
@@ -535,6 +540,20 @@ impl Run {
             Some(newest) => Err(CoordinatorError::Superseded { own: state.epoch, newest }),
             None => Ok(()),
         }
+    }
+
+    /// A coordinator that this one has replaced, and its workers, may do all that is left before they hear of
+    /// it: then nobody comes any more, and nothing is left to be done.
+    async fn check_commits(&mut self) -> Result<(), CoordinatorError> {
+        let now_ms = self.shared.clock.now_ms();
+        let is_alone = self.shared.state().worker_count() == 0;
+        if !is_alone || now_ms.saturating_sub(self.commits_checked_ms) < COMMITS_CHECK_MS {
+            return Ok(());
+        }
+        self.commits_checked_ms = now_ms;
+        let committed = self.shared.journal.committed_tasks().await?;
+        self.shared.change(|state, now_ms| state.see_commits(&committed, now_ms));
+        Ok(())
     }
 
     fn check_workers(&self) -> Result<(), CoordinatorError> {

@@ -50,6 +50,7 @@
 //! | a worker dies | its lease runs out, the task is leased again | the attempt |
 //! | a worker is asked to stop | it ends the task at hand within its drain time, or gives the lease back | at most the attempt |
 //! | a worker stops for ten minutes and wakes | its lease is lost; should it still commit, the commit is there or is the first: the same bytes (CL-3) | nothing |
+//! | a replaced coordinator sees all tasks through before it hears of it | the newer one, alone, lists the commits every half minute, and publishes the same dataset | nothing |
 //! | a worker is slow | an idle one gets a second attempt (SC-1); one commit wins, the other is told at its next heartbeat | an attempt |
 //! | a worker fails everything | its tasks go elsewhere, it pauses longer and longer | little |
 //! | the coordinator dies | workers look for it with growing pauses; the next one lists commits and goes on | what was not committed |

