@@ -207,7 +207,7 @@ async fn rows(store: &BakeStore, plan: &Plan) -> (Vec<CellRow>, Vec<ObjectRow>) 
     for task in plan.final_tasks() {
         let commit = store.get(&keys::commit(&plan.bake_id, task.id.0)).await.unwrap();
         let commit = v1::Commit::decode(commit).unwrap();
-        let [first, second] = &commit.parts[..] else { panic!("{commit:?}") };
+        let [first, second, ..] = &commit.parts[..] else { panic!("{commit:?}") };
         cells.extend(decode_cell_part(&first.key, store.get(&first.key).await.unwrap()).unwrap());
         objects.extend(
             decode_object_part(&second.key, store.get(&second.key).await.unwrap()).unwrap(),
