@@ -15,6 +15,8 @@ use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
+use crate::tcp_proxy::listen;
+
 /// Largest head of a request, bytes.
 const HEAD_BYTES_MAX: usize = 64 << 10;
 
@@ -122,14 +124,7 @@ impl FlakyProxy {
     /// When it cannot listen.
     #[must_use]
     pub fn before(server: u16, faults: Faults) -> Self {
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(1)
-            .enable_all()
-            .build()
-            .expect("a runtime starts");
-        let listener =
-            runtime.block_on(TcpListener::bind((Ipv4Addr::LOCALHOST, 0))).expect("a port is free");
-        let port = listener.local_addr().expect("it has an address").port();
+        let (runtime, listener, port) = listen();
         let (requests, met, is_calm) = Default::default();
         let shared = Arc::new(Shared { server, faults, requests, met, is_calm });
         runtime.spawn(accept(listener, Arc::clone(&shared)));

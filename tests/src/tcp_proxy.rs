@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::runtime::Runtime;
 use tokio::sync::watch;
 
 /// Most bytes that are passed on at a time.
@@ -29,7 +30,7 @@ struct Line {
 
 /// A running proxy; it ends when dropped.
 pub struct TcpProxy {
-    runtime: Option<tokio::runtime::Runtime>,
+    runtime: Option<Runtime>,
     port: u16,
     line: watch::Sender<Line>,
 }
@@ -41,14 +42,7 @@ impl TcpProxy {
     /// When it cannot listen.
     #[must_use]
     pub fn before(server: u16) -> Self {
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(1)
-            .enable_all()
-            .build()
-            .expect("a runtime starts");
-        let listener =
-            runtime.block_on(TcpListener::bind((Ipv4Addr::LOCALHOST, 0))).expect("a port is free");
-        let port = listener.local_addr().expect("it has an address").port();
+        let (runtime, listener, port) = listen();
         let line = Line { server, cuts: 0, is_stalled: false, delay: Duration::ZERO };
         let (line, seen) = watch::channel(line);
         runtime.spawn(accept(listener, seen));
@@ -80,6 +74,22 @@ impl TcpProxy {
     pub fn delay(&self, delay: Duration) {
         self.line.send_modify(|line| line.delay = delay);
     }
+}
+
+/// A runtime for a proxy, and a listener of it on a free port of loopback.
+///
+/// # Panics
+/// When there is none.
+pub(crate) fn listen() -> (Runtime, TcpListener, u16) {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .expect("a runtime starts");
+    let listener =
+        runtime.block_on(TcpListener::bind((Ipv4Addr::LOCALHOST, 0))).expect("a port is free");
+    let port = listener.local_addr().expect("it has an address").port();
+    (runtime, listener, port)
 }
 
 impl Drop for TcpProxy {
