@@ -35,7 +35,7 @@ pub struct CellTrace {
     pub batches: Vec<(u64, u32)>,
     /// Measurements of viewpoints: where, the seed of their directions, the number of rays.
     pub viewpoints: Vec<(DVec3, u64, u32)>,
-    /// Primitives that wrong rays met.
+    /// Primitives that rays met and the set lacked.
     pub missing: PrimitiveSet,
 }
 

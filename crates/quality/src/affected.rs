@@ -2,7 +2,7 @@
 //!
 //! A measurement depends on what its rays meet first. The same rays are cast into what was added, alone:
 //! only one that meets it is cast into the whole scene as well. Whether what was taken away was met, is
-//! known from the set and from what wrong rays met ([`crate::Scattered::missing`]).
+//! known from the set and from what rays met that it lacks ([`crate::Scattered::missing`]).
 
 use rayon::prelude::*;
 use sightline_geometry::raycast::{Ray, RayCaster};

@@ -50,7 +50,8 @@ pub struct CellError {
     pub cell: CellId,
     /// One result a viewpoint, in the order of the viewpoints.
     pub viewpoints: Vec<ViewpointError>,
-    /// Primitives that wrong rays met and the sets lack, in a fixed order; some of them often.
+    /// Primitives that rays met and the sets lack, in a fixed order; some of them often. What ties with a
+    /// member is among them, though its ray is not wrong.
     pub missing: Vec<PrimitiveId>,
 }
 
@@ -282,12 +283,12 @@ pub(crate) struct Tracer {
     caster: RayCaster,
     missing: Vec<Hit>,
     present: Vec<Hit>,
-    /// What the set lacks of what wrong rays met.
+    /// What the set lacks of what rays met.
     lacking: Vec<PrimitiveId>,
 }
 
 impl Tracer {
-    /// What the set lacks of what wrong rays met since the last call.
+    /// What the set lacks of what rays met since the last call.
     pub(crate) fn take_missing(&mut self) -> Vec<PrimitiveId> {
         std::mem::take(&mut self.lacking)
     }
@@ -304,9 +305,10 @@ impl Tracer {
         if let Some(hit) = nearest
             && !present(hit.primitive)
         {
+            // Whether it ties or not: what is met when it is gone may not tie.
+            self.lacking.push(hit.primitive);
             let of_set = self.caster.closest_occluder(geometry, ray, f64::INFINITY, present);
             if !of_set.is_some_and(|other| ties(geometry, ray, hit, other)) {
-                self.lacking.push(hit.primitive);
                 return true;
             }
         }

@@ -73,7 +73,8 @@ pub fn measure_scattered(
 pub struct Scattered {
     /// Rays that are wrong, in a fixed order.
     pub wrong: Vec<Suspect>,
-    /// Primitives that these rays met and the set lacks, in a fixed order; some of them often.
+    /// Primitives that rays met and the set lacks, in a fixed order; some of them often. What ties with a
+    /// member is among them, though its ray is not wrong.
     pub missing: Vec<PrimitiveId>,
 }
 
